@@ -1,6 +1,6 @@
-"""All errors that sphereorient raises on purpose, and what a track says of its frames (no errors): reasons and flags.
+"""All errors that sphereorient raises on purpose; and reasons and flags of a track's frames, which are no errors.
 
-Every message is worded by `refusal`: what was looked at, what was expected, what came, what to do.
+Every message is worded by `refusal`: what was checked, what was expected, what came, what to do.
 """
 
 from enum import IntFlag, StrEnum
@@ -15,7 +15,7 @@ class SphereOrientError(Exception):
 
 
 class ShapeError(SphereOrientError, ValueError):
-    """A tensor has another shape, type or values than the function works on."""
+    """A tensor has the wrong shape, type or values for the function."""
 
 
 class CameraError(SphereOrientError):
@@ -23,7 +23,7 @@ class CameraError(SphereOrientError):
 
 
 class MovieError(SphereOrientError):
-    """A movie is missing, unreadable, empty, or does not fit the other one."""
+    """A movie is missing, unreadable, empty, or does not match another one."""
 
 
 class TextureError(SphereOrientError):
@@ -31,7 +31,7 @@ class TextureError(SphereOrientError):
 
 
 class PaintError(SphereOrientError):
-    """Movies from which no texture map can be learnt."""
+    """No texture map can be learnt from the movies."""
 
 
 class ExperimentError(SphereOrientError):
@@ -39,15 +39,15 @@ class ExperimentError(SphereOrientError):
 
 
 class SettingsError(SphereOrientError, ValueError):
-    """A setting is unknown or its value impossible."""
+    """A setting is unknown, or its value is impossible."""
 
 
 class TrackError(SphereOrientError):
-    """A file is not a track that this version reads."""
+    """A file is not a track, or of an unreadable version."""
 
 
 class CheckpointError(SphereOrientError):
-    """A file is not a trained proposer that this version reads, or belongs to another sphere."""
+    """A file is not a trained proposer, of an unreadable version, or for another sphere."""
 
 
 class BenchError(SphereOrientError):
@@ -69,17 +69,17 @@ class Reason(StrEnum):
     REPEATED = "repeated"
     RUNAWAY = "runaway"
     LOW_SCORE = "low_score"
-    UNSEEN = "unseen"  # it shows paint that the texture map does not know
+    UNSEEN = "unseen"  # it shows unseen paint
     AMBIGUOUS = "ambiguous"
     CONTRADICTS = "contradicts"  # its line of sight misses the other camera's sphere
-    SECOND_BALL = "second_ball"  # likewise, in a movie with two balls: it may show the other one
+    SECOND_BALL = "second_ball"  # the same in a movie with two balls: it may show the other one
     HIDDEN = "hidden"  # another sphere covers it
     UNDECODABLE = "undecodable"
     MISSING = "missing"
 
 
 class Flag(IntFlag):
-    """What is special about a frame: bits of the dataset `flags`."""
+    """Special properties of a frame: bits of the dataset `flags`."""
 
     POSITION_INTERPOLATED = 1
     POSITION_OUTLIER_REPLACED = 2
@@ -91,23 +91,23 @@ class Flag(IntFlag):
     SPIKE = 128
     EXTRAPOLATED = 256
     CONTRADICTION = 512
-    IDENTITY = 1024  # of several spheres: it may be another one, see the dataset `identity`
+    IDENTITY = 1024  # the sphere may be another one, see the dataset `identity`
 
 
 def refusal(name: str, *, expected: str, got: str, do: str) -> str:
-    """Word a refusal in one line; `name` is the thing with its file, `do` the remedy, without full stop."""
+    """Return a refusal as one line; `name` is the object with its file, `do` the remedy, without full stop."""
     return f"{name}: expected {expected}, got {got}; {do}."
 
 
 def error_words(error: Exception) -> str:
-    """Return the error of a library or the system in one line of at most 200 characters."""
+    """Return the error of a library or the system as one line of at most 200 characters."""
     text = str(getattr(error, "strerror", None) or error)
     return f"'{text.splitlines()[0][:200]}'" if text else type(error).__name__
 
 
 def tensor_of(name: str, values: Any) -> "Tensor":
     """Return a tensor, or an array or numbers as one; refuse anything else (ShapeError)."""
-    import torch  # a second, which `sphereorient --help` does not need
+    import torch  # takes a second, not needed for `sphereorient --help`
 
     try:
         return torch.as_tensor(values)

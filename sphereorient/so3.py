@@ -14,9 +14,9 @@ from sphereorient.files.compiled import compiled, record
 
 SOURCE = Path(__file__).with_suffix("")
 _Rotations = record(SOURCE, "Rotations")
-NO_ROTATION = 1e-3  # of an entry of R R^T - I: far beyond rounding, half a milliradian
-ROUNDING = 1e-9  # a count that is a whole number by geometry must not be rounded up for the last bits of a sine
-HALF_EDGE = 2 ** (1 / 3) / 2  # half the cube's edge of the body-centred cubic lattice with a point per unit of volume
+NO_ROTATION = 1e-3  # tolerance of an entry of R R^T - I, far above rounding: half a milliradian
+ROUNDING = 1e-9  # keeps a whole number from being rounded up by the last bits of a sine
+HALF_EDGE = 2 ** (1 / 3) / 2  # half the edge of the body-centred cubic lattice with one point per unit volume
 
 
 def exp(rotvec: Tensor) -> Tensor:
@@ -25,7 +25,7 @@ def exp(rotvec: Tensor) -> Tensor:
     if (done := _compiled("so3_exp", rotvec, 1, (3, 3))) is not None:
         return done
     turn = torch.linalg.vector_norm(rotvec, dim=-1)[..., None, None]
-    # sin(t) / t and (1 - cos(t)) / t^2; a branch that is not taken needs a finite argument for its gradient.
+    # sin(t) / t and (1 - cos(t)) / t^2; the unused branch needs a finite argument for its gradient.
     some = turn > torch.finfo(turn.dtype).tiny ** 0.25
     t = torch.where(some, turn, torch.ones_like(turn))
     along = torch.where(some, t.sin() / t, torch.ones_like(t))
@@ -60,8 +60,8 @@ def log(R: Tensor) -> Tensor:
 
 
 def _compiled(name: str, given: Tensor, dims: int, tail: tuple[int, ...]) -> Tensor | None:
-    """Return what compiled code makes of items of `dims` dimensions: items of shape `tail`. None where it cannot: it
-    was not built, numbers are no doubles of this machine, or somebody asks for derivatives.
+    """Return the result of compiled code for items of `dims` dimensions: items of shape `tail`. None if it was not
+    built, the numbers are no doubles on the CPU, or derivatives are needed.
     """
     code = compiled(SOURCE, _Rotations)
     plain = type(given) is Tensor and given.dtype == torch.float64 and given.device.type == "cpu"
@@ -70,7 +70,7 @@ def _compiled(name: str, given: Tensor, dims: int, tail: tuple[int, ...]) -> Ten
     given = given.contiguous()
     try:
         begin = given.data_ptr()
-    except RuntimeError:  # a tensor of torch.func has no numbers of its own
+    except RuntimeError:  # a tensor of torch.func has no storage
         return None
     made = given.new_empty(*given.shape[: given.ndim - dims], *tail)
     getattr(code, name)(ctypes.byref(_Rotations(made.numel() // math.prod(tail), begin, made.data_ptr())))
@@ -78,7 +78,7 @@ def _compiled(name: str, given: Tensor, dims: int, tail: tuple[int, ...]) -> Ten
 
 
 def check_rotations(name: str, R: Tensor) -> None:
-    """Refuse matrices (..., 3, 3) that are no rotations (ShapeError); rows with NaN, for what is unknown, pass."""
+    """Refuse matrices (..., 3, 3) that are no rotations (ShapeError); NaN, for unknown ones, are allowed."""
     check_tail(name, R, 3, 3)
     if not R.is_floating_point():
         do = "convert it with .double() or .float()"
@@ -102,7 +102,7 @@ def hat(v: Tensor) -> Tensor:
 
 
 def vee(M: Tensor) -> Tensor:
-    """Return the vector (..., 3) of a matrix' antisymmetric part; of a rotation it is axis times sine of the angle."""
+    """Return the vector (..., 3) of a matrix' antisymmetric part; for a rotation: axis times sine of the angle."""
     check_tail("M", M, 3, 3)
     twice = M - M.mT
     return torch.stack([twice[..., 2, 1], twice[..., 0, 2], twice[..., 1, 0]], -1) / 2
@@ -115,7 +115,7 @@ def angle(R: Tensor) -> Tensor:
     """
     check_tail("R", R, 3, 3)
     cosine = (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
-    # vector_norm has gradient 0 at 0, which is the branch at 0 and pi; atan2 itself is smooth at both.
+    # vector_norm has gradient 0 at 0, that is at angles 0 and pi; atan2 is smooth at both.
     return torch.atan2(torch.linalg.vector_norm(vee(R), dim=-1), cosine)
 
 
@@ -128,15 +128,15 @@ def geodesic_distance(A: Tensor, B: Tensor) -> Tensor:
     check_tail("B", B, 3, 3)
     D = B - A
     # A^T A is symmetric, so A^T B and A^T (B - A) have the same vee: with rows a, d it is half the sum of d × a.
-    # The difference keeps its digits where A and B are close; the product A^T B would not.
+    # Unlike the product A^T B, the difference keeps its digits if A and B are close.
     sine = torch.linalg.vector_norm(torch.linalg.cross(D, A.expand_as(D)).sum(-2), dim=-1) / 2
     return torch.atan2(sine, 1 - D.square().sum((-2, -1)) / 4)
 
 
 def nearest_rotation(M: Tensor) -> Tensor:
     """Return the rotation nearest to any matrix M (..., 3, 3), by the sum of squared differences; NaN if not finite.
-    Where several are equally near (rank below 2, or a reflection with equal smallest singular values) it is one of
-    them, with gradient 0 in the undetermined directions. First derivatives only.
+    If several are equally near (rank below 2, or a reflection with equal smallest singular values) it is one of them,
+    with gradient 0 in the undetermined directions. First derivatives only.
     Source: Kabsch 1976, the paper's R_kabsch; derivative of the polar factor, textbook.
     """
     check_tail("M", M, 3, 3)
@@ -159,8 +159,8 @@ def nearest_rotation(M: Tensor) -> Tensor:
 
 def weighted_mean(R: Tensor, weights: Tensor) -> Tensor:
     """Return the rotation (..., 3, 3) with the smallest weighted sum of squared angles to R (..., K, 3, 3).
-    Weights (..., K) are not negative, of any sum; NaN rotations of weight 0 do not count; NaN where all weights are 0.
-    Where several means are equally good, the choice is always the same.
+    Weights (..., K) are not negative, of any sum; NaN rotations of weight 0 are ignored; NaN if all weights are 0.
+    If several means are equally good, the choice is always the same.
     Source: Karcher mean; Hartley et al. 2013, Rotation averaging, algorithm 1.
     """
     check_tail("R", R, *weights.shape[-1:], 3, 3)
@@ -219,18 +219,18 @@ def to_tait_bryan(R: Tensor) -> Tensor:
     """
     check_tail("R", R, 3, 3)
     cos_y = torch.linalg.vector_norm(R[..., 0, :2], dim=-1)
-    defined = ~(cos_y <= 4 * torch.finfo(R.dtype).eps)  # of no rotation, NaN, all three angles are NaN
+    defined = ~(cos_y <= 4 * torch.finfo(R.dtype).eps)  # for NaN all three angles are NaN
     zero, one = torch.zeros_like(cos_y), torch.ones_like(cos_y)
     theta_z = torch.atan2(torch.where(defined, -R[..., 0, 1], zero), torch.where(defined, R[..., 0, 0], one))
-    # R Rz^T = Rx Ry, whose second column (0, cos theta_x, sin theta_x) does not shrink with cos theta_y.
+    # R Rz^T = Rx Ry has the second column (0, cos theta_x, sin theta_x), independent of theta_y.
     column = R[..., 1:, 0] * theta_z.sin()[..., None] + R[..., 1:, 1] * theta_z.cos()[..., None]
     theta_x = torch.atan2(column[..., 1], column[..., 0])
     return torch.stack([theta_x, torch.atan2(R[..., 0, 2], cos_y), theta_z], -1)
 
 
 def second_triplet(theta: Tensor) -> Tensor:
-    """Return the other angles (..., 3), rad, not wrapped, of the rotation of theta (..., 3), rad.
-    They are theta_x + pi, ± pi - theta_y with the sign of theta_y, theta_z + pi.
+    """Return the other angles (..., 3), rad, not wrapped, of the rotation by theta (..., 3), rad:
+    theta_x + pi, ± pi - theta_y with the sign of theta_y, theta_z + pi.
     Source: the paper's second triplet with sign(0) = 1, docs/errata.md E2.
     """
     check_tail("theta", theta, 3)
@@ -240,7 +240,7 @@ def second_triplet(theta: Tensor) -> Tensor:
 
 
 def rate_matrix_lab(theta: Tensor) -> Tensor:
-    """Return H (..., 3, 3) with H dtheta/dt = omega_lab, of the angles of R_lab_body; its determinant is cos(theta_y).
+    """Return H (..., 3, 3) with H dtheta/dt = omega_lab, for the angles of R_lab_body; its determinant is cos(theta_y).
     Source: the paper's H, which it assigns to the body (docs/errata.md E3).
     """
     check_tail("theta", theta, 3)
@@ -263,7 +263,7 @@ def to_lattman(theta: Tensor) -> Tensor:
 
 
 def from_lattman(lattman: Tensor) -> Tensor:
-    """Return the Tait-Bryan angles (..., 3), rad, of Lattman's, of ranges 4 pi, -pi/2 .. pi/2, 2 pi over SO(3)."""
+    """Return the Tait-Bryan angles (..., 3), rad, of Lattman angles with ranges 4 pi, -pi/2 .. pi/2, 2 pi."""
     check_tail("lattman", lattman, 3)
     plus, y, minus = lattman.unbind(-1)
     return torch.stack([(plus + minus) / 2, y, (plus - minus) / 2], -1)
@@ -271,7 +271,7 @@ def from_lattman(lattman: Tensor) -> Tensor:
 
 def lattman_steps(theta_y: Tensor, delta: float) -> tuple[Tensor, Tensor]:
     """Return the steps of theta_plus and theta_minus, (...) rad each, that rotate by `delta` rad.
-    theta_y (...), rad, is in -pi/2 .. pi/2; at these ends, where an angle has no effect, its step is infinite.
+    theta_y (...), rad, is in -pi/2 .. pi/2; at the ends one angle has no effect and an infinite step.
     Source: d^2 = dtheta^2 + sin^2(pi/4 + theta/2) dtheta_plus^2 + sin^2(pi/4 - theta/2) dtheta_minus^2, the paper's own
     metric; the steps that it prints do not follow from it (docs/errata.md E5).
     """
@@ -323,12 +323,12 @@ def local_grid(
         do = "give the radius in rad, or take lattman_grid for all rotations"
         raise SettingsError(refusal("radius_rad", expected="0 .. pi", got=f"{radius_rad}", do=do))
     unit = HALF_EDGE * step_rad
-    reach = radius_rad / unit * (1 + 1e-9)  # keeps a shell that is exactly on the rim
+    reach = radius_rad / unit * (1 + 1e-9)  # keeps a shell exactly on the rim
     line = torch.arange(-math.floor(reach), math.floor(reach) + 1)
     places = torch.cartesian_prod(line, line, line)
     norm2 = places.square().sum(1)
     inside = (norm2 <= math.floor(reach**2)) & (places % 2 == places[:, :1] % 2).all(1)
-    # whole numbers: ties in angle are exact, and the stable sort keeps them in the order of the places
+    # in whole numbers ties in angle are exact, and the stable sort keeps their order
     order = norm2[inside].argsort(stable=True)
     return exp(places[inside][order].to(torch.float64) * unit).to(dtype=dtype, device=device)
 

@@ -1,4 +1,4 @@
-"""Beam search over the histories of a movie, forward and backward: the best one, and each candidate's probability.
+"""Beam search over the histories of a movie, forward and backward: the best history, and each candidate's probability.
 
 A history names the right candidate of each frame, or none, and the breaks of the motion. A state is the last two frames
 with an orientation: the next candidate is compared with the omega between them.
@@ -13,29 +13,29 @@ from numpy.typing import NDArray
 from sphereorient.assemble.second_order_cost import VARIANCE_MAX, Floats, SecondOrderCost
 from sphereorient.trajectory import runs_of
 
-# The sweep is sequential, each step a hundred operations on few numbers: numpy's cost a quarter of torch's.
+# The sweep is sequential, with a hundred operations on few numbers per step: numpy takes a quarter of torch's time.
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-NOT_YET, LOST = -1, -2  # in place of the frame of the last orientation
-SMALL = 1e-12  # rad; keeps quotients of rotations by nothing finite
-BEAM_NATS = 30.0  # more than a break and a new beginning cost
-STATES_MAX = 256  # histories kept of each frame, at most: bounds time and memory
-STUCK_FRAMES = 3  # a stuck candidate may be absent for this many frames, less one
-PIN_NATS = 6.0  # least gain of following the motion in every frame of a run without search
-PIN_ALONE_NATS = 12.0  # by which every other candidate of such a frame costs more
-PIN_MARGIN = 3  # frames at either end of such a run that are searched nevertheless
-NEAR_WHOLE_TURN = 1.0  # rad; nearer, two orientations do not determine the axis of the rotation between them
-REST_SHARE = 0.5  # prior share of new spheres with an omega as small as its changes
+NOT_YET, LOST = -1, -2  # instead of the frame of the last orientation
+SMALL = 1e-12  # rad; keeps quotients by a zero rotation finite
+BEAM_NATS = 30.0  # more than the cost of a break and a new start
+STATES_MAX = 256  # most histories kept per frame, to bound time and memory
+STUCK_FRAMES = 3  # a stuck candidate may be absent for one frame less than this
+PIN_NATS = 6.0  # least gain by the motion in every frame of a run without search
+PIN_ALONE_NATS = 12.0  # least extra cost of every other candidate of such a frame
+PIN_MARGIN = 3  # searched frames at either end of such a run
+NEAR_WHOLE_TURN = 1.0  # rad; nearer to a whole turn, the axis of a rotation is undetermined
+REST_SHARE = 0.5  # prior share of motions that begin with an omega as small as its changes
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CandidateRows:
-    """Candidates of the F frames that have any, as rows; made by `physical_path`."""
+    """Candidates of the F frames with candidates, as rows."""
 
     R_lab_body: Floats  # (M, 3, 3)
     variance: Floats  # (M,), rad^2 per axis
-    log_weight: Floats  # (M,), of the candidate among those of its frame, by the pictures alone
+    log_weight: Floats  # (M,), of the candidate within its frame, by the pictures alone
     offset: Ints  # (F + 1,), rows of each frame
     time_s: Floats  # (F,)
     frame_s: float  # usual time between frames of the movie
@@ -53,7 +53,7 @@ class CandidateRows:
         return replace(self, **parts, offset=offset, time_s=self.time_s[first:last])
 
     def zones(self, dt_s: Floats) -> Ints:
-        """Return the number of possible rotations over a time: below half a turn in each frame interval."""
+        """Return the number of possible rotations over a time, each below half a turn per frame interval."""
         return np.maximum(np.rint(dt_s / self.frame_s).astype(np.int64), 1)
 
 
@@ -61,11 +61,11 @@ class CandidateRows:
 class PathStates:
     """Ends of histories at one frame, S of them."""
 
-    frame: Ints  # of the last orientation; LOST or NOT_YET without one to continue from
+    frame: Ints  # of the last orientation; LOST or NOT_YET if there is none to continue
     row: Ints  # of the last orientation
     turn: Floats  # (S, 3), rad, over the span
-    span: Floats  # s, between the last two orientations; 0 where a motion begins
-    before: Floats  # rad^2 per axis, of the last but one
+    span: Floats  # s, between the last two orientations; 0 at the start of a motion
+    before: Floats  # rad^2 per axis, of the last orientation but one
 
     @classmethod
     def begin(cls, frame: int, row: Ints) -> "PathStates":
@@ -84,8 +84,8 @@ class BeamStep:
 
     frame: int
     states: PathStates
-    source: Ints  # (E,), among the states of the step before
-    target: Ints  # (E,), among these
+    source: Ints  # (E,), index of a state of the previous step
+    target: Ints  # (E,), index of a state of this step
     cost: Floats  # (E,)
     best: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (S,), edge of the cheapest history
 
@@ -94,12 +94,12 @@ class BeamStep:
 class Histories:
     """Result of a `BeamSearch`, F frames and M rows."""
 
-    row: Ints  # (F,), row chosen, -1 without
-    begins: Bools  # (F,), the orientation of the frame begins a motion
-    breaks: Bools  # (F,), it begins one although the motion before could have continued
-    turn_rad: Floats  # (F, 3), from the orientation before, whole turns included; NaN where a motion begins
+    row: Ints  # (F,), chosen row; -1: none
+    begins: Bools  # (F,), a motion begins at the frame
+    breaks: Bools  # (F,), a motion begins although the previous one could have continued
+    turn_rad: Floats  # (F, 3), from the previous orientation, with whole turns; NaN where a motion begins
     posterior: Floats  # (M,), probability of each row
-    evidence: float  # log of how much more probable the movie is with a motion in it than without
+    evidence: float  # log of the ratio of the movie's probability with a motion to that without
 
 
 class BeamSearch:
@@ -109,8 +109,8 @@ class BeamSearch:
         self.rows, self.cost = rows, cost
         self.time, self.offset = rows.time_s, rows.offset
         self.still, self.log_stuck = still_log_ratio(rows, cost), np.log(float(cost.stuck_probability))
-        self.hole_s = (gap_frames_max + 1.5) * rows.frame_s  # half a frame for uneven times
-        self.hit, self.miss = (np.array(each) for each in cost.presence())  # index: the last frame was a hit
+        self.hole_s = (gap_frames_max + 1.5) * rows.frame_s  # half a frame more, for uneven times
+        self.hit, self.miss = (np.array(each) for each in cost.presence())  # index: the previous frame was a hit
         self.breaks, self.goes_on = -math.log(cost.break_probability), -math.log1p(-cost.break_probability)
         self.main = np.lexsort((-rows.log_weight, rows.frame))[rows.offset[:-1]]  # (F,), likeliest row by the pictures
         self.chain_cost, self.chain_turn, self.last_pin = self._pins(gap_frames_max + 2)
@@ -128,7 +128,7 @@ class BeamSearch:
             step, least, total = self._arrive(self._step(states, least, f), least, total)
             steps.append(step)
             totals.append(total)
-            if self.last_pin[f] > f:  # only one state is left: no search until the run's end
+            if self.last_pin[f] > f:  # only one state: no search until the run's end
                 step = self._jump(step, self.last_pin[f])
                 least, total = least + step.cost, total + step.cost
                 steps.append(step)
@@ -137,7 +137,7 @@ class BeamSearch:
         return self._read(steps, totals, int(least.argmin()))
 
     def _step(self, states: PathStates, least: Floats, f: int) -> BeamStep:
-        """Return all ways from some states to frame f: begin at a candidate, continue to one, or to none."""
+        """Return all edges from states to frame f: begin at a candidate, continue to one, or to none."""
         dt, alive = self._alive(states, f)
         fresh = (states.frame == f - 1).astype(np.int64)
         hit, miss = self.hit[fresh], self.miss[fresh]
@@ -171,18 +171,18 @@ class BeamSearch:
         return dt, tracked & (dt <= self.hole_s) & ((states.span == 0) | (predicted <= VARIANCE_MAX))
 
     def _candidate_cost(self, rows: Ints | slice, log_ratio: Floats) -> Floats:
-        """Return the cost of candidates by pictures and motion; `log_ratio`: of the density there by the motion."""
+        """Return the cost of candidates by pictures and motion; `log_ratio`: of the density by the motion."""
         return self.cost.candidate(log_ratio, self.still[rows]) - self.rows.log_weight[rows]
 
     def _begin(self, source: Ints, cost: Floats, f: int) -> BeamStep:
-        """Begin a motion at each candidate: it may have any orientation, so its ratio to the uniform density is 1."""
+        """Begin a motion at each candidate: any orientation is possible, so its ratio to the uniform density is 1."""
         rows = np.arange(self.offset[f], self.offset[f + 1])
         source, target = np.repeat(source, len(rows)), np.tile(np.arange(len(rows)), len(source))
         total = (cost[:, None] + self._candidate_cost(rows, np.zeros(len(rows)))).ravel()
         return BeamStep(frame=f, states=PathStates.begin(f, rows), source=source, target=target, cost=total)
 
     def _go_on(self, states: PathStates, source: Ints, dt: Floats, cost: Floats, f: int) -> BeamStep:
-        """Continue states that have an omega, by the rotation nearest to its prediction."""
+        """Continue states with an omega, by the rotation nearest to its prediction."""
         rows = np.arange(self.offset[f], self.offset[f + 1])
         R, R_before = self.rows.R_lab_body[rows], self.rows.R_lab_body[states.row]
         expected = states.turn / states.span[:, None] * dt[:, None]
@@ -199,7 +199,7 @@ class BeamSearch:
         around = np.clip(around, -(zones // 2), (zones - 1) // 2)
         turn = (angle + 2 * math.pi * around)[..., None] * axis
         if whole.any():
-            # The small difference has another axis than omega: keep omega's axis and lengthen the rotation.
+            # Keep the axis of omega and lengthen the rotation; the axis of the small difference is another one.
             ahead = expected[:, None] / np.maximum(length, 1e-300)[..., None]
             longer = length + (off[..., None] * axis_off * ahead).sum(-1)
             turn = np.where(whole[..., None], ahead * longer[..., None], turn)
@@ -209,7 +209,7 @@ class BeamSearch:
         return replace(step, source=source[of_state], cost=total.ravel())
 
     def _second(self, states: PathStates, source: Ints, dt: Floats, cost: Floats, f: int) -> BeamStep:
-        """Continue from the first frame of a motion: slowly, or by any rotation that the time allows."""
+        """Continue from the first frame of a motion: slowly, or by any rotation possible in the time."""
         rows = np.arange(self.offset[f], self.offset[f + 1])
         angle, axis = rotation_between(self.rows.R_lab_body[states.row][:, None], self.rows.R_lab_body[rows])
         zones = self.rows.zones(dt)
@@ -234,7 +234,7 @@ class BeamSearch:
         return BeamStep(frame=f, states=onward, source=of_state, target=key, cost=np.zeros(len(row)))
 
     def _arrive(self, step: BeamStep, least: Floats, total: Floats) -> tuple[BeamStep, Floats, Floats]:
-        """Reduce the edges to the best and to the sum of each state; drop the states far behind."""
+        """Reduce the edges to the best and to the sum of each state; drop states far behind."""
         size = len(step.states.row)
         arriving = least[step.source] + step.cost
         order = np.lexsort((arriving, step.target))
@@ -253,9 +253,9 @@ class BeamSearch:
         return pruned, new_least[near], new_total[near]
 
     def _pins(self, length: int) -> tuple[Floats, Floats, Ints]:
-        """Find runs of frames whose likeliest candidates follow the motion, and no others: all good histories contain
-        them. Return, per frame, cost and rotation from the two frames before, and, with one more frame at the end, the
-        last frame of a run inside its margins at the second of two frames with one candidate each, -1 elsewhere.
+        """Find runs of frames in which only the likeliest candidates follow the motion: all good histories contain
+        them. Return, per frame, cost and rotation from the previous two frames. Return also, with one more frame at the
+        end, the last frame of a run inside its margins at the second of two frames with one candidate each, else -1.
         """
         frames, main = len(self.time), self.main
         cost, turn, last = np.zeros(frames), np.zeros((frames, 3)), np.full(frames + 1, -1)
@@ -287,7 +287,7 @@ class BeamSearch:
             if end - begin + 2 < max(length, 2 * PIN_MARGIN + 4):
                 continue
             first, stop = begin + PIN_MARGIN + 1, end + 1 - PIN_MARGIN
-            # There one state is left.
+            # Only one state is left there.
             starts = first + np.flatnonzero(single[first:stop] & single[first - 1 : stop - 1])
             if len(starts):
                 last[starts[0]] = stop
@@ -345,15 +345,15 @@ def still_log_ratio(rows: CandidateRows, cost: SecondOrderCost) -> Floats:
 
 
 def merge_equal(step: BeamStep, least: Floats) -> BeamStep:
-    """Merge states of equal key, which stands in `target`; the cheapest way gives the state."""
-    order = np.argsort(least[step.source] + step.cost, kind="stable")  # so that the first of equal keys is the cheapest
+    """Merge states with equal keys, which are in `target`; the cheapest edge gives the state."""
+    order = np.argsort(least[step.source] + step.cost, kind="stable")  # the first of equal keys is the cheapest
     _, first, target = np.unique(step.target[order], return_index=True, return_inverse=True)
     states = step.states.take(order[first])
     return replace(step, states=states, source=step.source[order], target=target, cost=step.cost[order])
 
 
 def concatenated(ways: list[BeamStep], *, shared_targets: bool = False) -> BeamStep:
-    """Put several ways side by side; renumber their targets unless they are shared keys."""
+    """Join several sets of edges; renumber their targets unless they are shared keys."""
     sizes = np.cumsum([0, *(0 if shared_targets else len(way.states.row) for way in ways)])
     parts = {e.name: np.concatenate([getattr(way.states, e.name) for way in ways]) for e in fields(PathStates)}
     source, cost = (np.concatenate([getattr(way, name) for way in ways]) for name in ("source", "cost"))
@@ -362,7 +362,7 @@ def concatenated(ways: list[BeamStep], *, shared_targets: bool = False) -> BeamS
 
 
 def soft_min(values: Floats, group: Ints, size: int) -> Floats:
-    """Return -log sum exp(-values) of each group, (size,); inf where it is empty."""
+    """Return -log sum exp(-values) of each group, (size,); inf if empty."""
     low = np.full(size, np.inf)
     np.minimum.at(low, group, values)
     finite = np.isfinite(values)

@@ -1,4 +1,4 @@
-"""Which of several balls that look alike is which, over the whole movie: by their motion alone, as one assignment."""
+"""Identities of several balls that look alike over the whole movie: from their motion alone, as one assignment."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from sphereorient.trajectory import runs_of
 
 FITTED = 6  # frames from which a motion is extrapolated
 ORDER = 2  # of its polynomial
-JUMP = 12.0  # times the usual error of an extrapolation to the next frame: a piece may end here
-SAMPLES = 200  # windows of which the errors of one gap are measured
-SHARE, OF_CHI = 90.0, 2.5  # percentile of an error's length, and what this is of a normal one of three components
-NO_LINK = 60.0  # chi2 of a piece that follows none
-FARTHEST = 256  # frames over which pieces are linked
-CERTAIN = 0.9999  # probability from which a name was never in doubt
+JUMP = 12.0  # times the usual error of an extrapolation to the next frame, from which a piece may end
+SAMPLES = 200  # windows for the errors of one gap
+SHARE, OF_CHI = 90.0, 2.5  # percentile of an error's length, and its value for three normal components
+NO_LINK = 60.0  # chi2 of a piece without predecessor
+FARTHEST = 256  # longest gap between linked pieces, frames
+CERTAIN = 0.9999  # probability from which a name is certain
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,14 +34,14 @@ class _Piece:
 
 @dataclass(frozen=True, eq=False)
 class _Motions:
-    """Poses of K rows in N frames, and how far extrapolations of them err."""
+    """Poses of K rows in N frames, and the errors of their extrapolation."""
 
     position_lab_mm: Floats  # (K, N, 3)
     R_lab_body: Floats  # (K, N, 3, 3)
     time_s: Floats  # (N,)
 
     def away(self, frames: Ints, row: int, to_row: int, to: int) -> Floats:
-        """Return move (mm) and turn (rad), (2,), of a row's pose off its prediction by frames, the nearest first."""
+        """Return the deviation, mm and rad, (2,), of a row's pose from its prediction by frames, nearest first."""
         t = self.time_s[frames] - self.time_s[frames[0]]
         scale = np.abs(t).max() or 1.0
         R0 = self.R_lab_body[row, frames[0]]
@@ -59,10 +59,10 @@ class _Motions:
 def same_balls(
     position_lab_mm: Floats, R_lab_body: Floats, seen: Bools, time_s: Floats, breaks: Sequence[int]
 ) -> tuple[Ints, Floats]:
-    """Return which row is which ball, (K, N): that of each ball in each frame, and the probability that the ball has
-    kept its name, (K, N), NaN where that was never in doubt.
-    Pieces of rows, which end where the row may have changed to another ball, are linked by the errors of extrapolating
-    each of two pieces to the other, in place and rotation, over the errors that this makes within pieces.
+    """Return which row is which ball, (K, N), for each ball in each frame, and the probability that the ball has kept
+    its name, (K, N), NaN where it was certain.
+    Rows are cut into pieces where a row may have changed to another ball. Pieces are linked by the errors of
+    extrapolating position and rotation of each to the other, over the errors of such extrapolations within pieces.
 
     Args:
         position_lab_mm: (K, N, 3), of K rows in N frames.
@@ -90,9 +90,9 @@ def same_balls(
             chain.append(after[chain[-1]])
         spans = [slice(pieces[k].first, pieces[k].last) for k in chain]
         free = [ball for ball in range(rows) if not any(taken[ball, span].any() for span in spans)]
-        free = free or [own]  # more pieces at one time than balls: the last one goes where it was
+        free = free or [own]  # more pieces at a time than balls: the last one keeps its row
         ball = own if own in free else free[0]
-        # A piece that follows none may be any ball that is not followed.
+        # A piece without predecessor may be any ball without successor.
         first = 1.0 if pieces[start].first == 0 or len(free) == 1 else 1.0 / len(free)
         for k, span, share in zip(chain, spans, likely, strict=True):
             order[ball, span], taken[ball, span] = pieces[k].row, True
@@ -101,7 +101,7 @@ def same_balls(
 
 
 def _whole(order: Ints, taken: Bools) -> Ints:
-    """Return an order in which rows without a ball belong to the balls without a row."""
+    """Return an order in which rows without a ball get the balls without a row."""
     for frame in np.flatnonzero(~taken.all(0)):
         balls = np.flatnonzero(~taken[:, frame])
         left = sorted(set(range(len(order))) - set(order[taken[:, frame], frame].tolist()))
@@ -138,7 +138,7 @@ def _scale(motions: _Motions, pieces: Sequence[_Piece]) -> Floats:
 
 
 def _error(scale: Floats, gap: int) -> Floats:
-    """Return the error of an extrapolation over a gap, (2,): mm and rad; beyond all that is known with its square."""
+    """Return the error of an extrapolation over a gap, (2,): mm and rad; quadratic beyond the known gaps."""
     at = min(gap, scale[-1, 0])
     known = np.array([np.exp(np.interp(np.log(at), np.log(scale[:, 0]), np.log(part))) for part in scale[:, 1:].T])
     return np.asarray(known * (gap / at) ** 2)
@@ -158,7 +158,7 @@ def _without_jumps(motions: _Motions, piece: _Piece, scale: Floats) -> Iterator[
 
 
 def _links(motions: _Motions, pieces: Sequence[_Piece], scale: Floats) -> dict[tuple[int, int], float]:
-    """Return chi2 of each pair of pieces of which one may follow the other."""
+    """Return chi2 of each pair of pieces in which one may follow the other."""
     links = {}
     for j, later in enumerate(pieces):
         ahead = np.arange(later.first, min(later.last, later.first + FITTED))
@@ -173,10 +173,10 @@ def _links(motions: _Motions, pieces: Sequence[_Piece], scale: Floats) -> dict[t
 
 
 def _linked(count: int, links: dict[tuple[int, int], float]) -> dict[int, int]:
-    """Return the piece that follows each piece that one does: the assignment of the least sum of chi2."""
+    """Return the successor of each piece that has one: the assignment with the least sum of chi2."""
     ends, begins = np.array(list(links), dtype=np.int64).reshape(-1, 2).T
     every = np.arange(count)
-    # A piece that none follows, and one that follows none, are linked to places that stand for that.
+    # Pieces without successor or predecessor are linked to dummy places.
     row = np.concatenate([ends, every, count + every, count + begins])
     column = np.concatenate([begins, count + every, every, count + ends])
     tiny = 1e-9  # 0 means no link
@@ -188,7 +188,7 @@ def _linked(count: int, links: dict[tuple[int, int], float]) -> dict[int, int]:
 
 
 def _sure(end: int, after: dict[int, int], links: dict[tuple[int, int], float]) -> float:
-    """Return the probability of a link among those in which it is exchanged with another one."""
+    """Return the probability of a link among the exchanges with one other link."""
     begin, odds = after[end], 0.0
     for other_end, other_begin in after.items():
         exchanged = [links.get(pair) for pair in ((end, other_begin), (other_end, begin))]

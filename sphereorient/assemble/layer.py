@@ -1,4 +1,4 @@
-"""Differentiable paths: a layer with parameters that can be learnt, and the soft track of fitted candidates.
+"""Differentiable paths: a layer with learnable parameters, and the soft track of fitted candidates.
 
 docs/differentiable.md connects the soft track to the cameras.
 """
@@ -22,26 +22,26 @@ from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
 
 Values = Tensor | NDArray[np.floating]
 
-TRIPLES_AT_ONCE = 1 << 20  # whose misfits are held at once, 8 MB each array
-EVEN = 1e-9  # of a ratio of times: the expected rotation is off by less than 4e-9 rad
-LOST_RAD2 = 1e6  # variance of the place for no candidate: a prediction without information
+TRIPLES_AT_ONCE = 1 << 20  # triples held at once, 8 MB per array
+EVEN = 1e-9  # tolerance of a ratio of times: the error of the expected rotation is below 4e-9 rad
+LOST_RAD2 = 1e6  # variance of the place for no candidate: no prediction
 LEAST = {"tail": 2.0}  # bounds of parameters, as in PathSettings
 MOST = {name: 1.0 for name in PARAMETERS if name.endswith("probability") or name == "evidence_doubt"}
 MOST |= {"stuck_probability": 0.5, "follow_probability": 0.5}
 
 
 class PathLayer(nn.Module):
-    """Choose among candidate orientations along time; the methods `paper` (order 1) and `precise` (order 2) call it.
-    Order 1 is the paper's: an edge costs d(A, B) (2 - T_A - T_B) / dt. Order 2 has the `SecondOrderCost`: its hard path
-    is a beam search, its soft path a recursion through which the cost is learnt. In the soft path a break of the motion
-    is a mixture and no state, rotations between frames visited are below half a turn, and omega is forgotten after a
-    frame without a right candidate, which has a place of its own.
+    """Choose among candidate orientations along time, for the methods `paper` (order 1) and `precise` (order 2). In
+    order 1, the paper's, an edge costs d(A, B) (2 - T_A - T_B) / dt. Order 2 has the `SecondOrderCost`. Its hard path
+    is a beam search; its soft path is a recursion from which the cost is learnt. In the soft path a break of the motion
+    is a mixture instead of a state, rotations between visited frames are below half a turn, and omega is forgotten
+    after a frame without a right candidate, which has its own place.
 
     Args:
         order: 1 or 2.
         soft: temperature of the soft path, in units of the costs; None: the cheapest, or most probable, path.
-        settings: AssembleSettings (order 1) or PathSettings (order 2). In a soft path of order 2 the settings of the
-            cost, with an acceleration, become parameters of the module: logarithms, or logits of probabilities.
+        settings: AssembleSettings (order 1) or PathSettings (order 2). In a soft path of order 2 the settings of
+            the cost, with an acceleration, become parameters of the module: logarithms, or logits of probabilities.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class PathLayer(nn.Module):
 
     @property
     def settings(self) -> AssembleSettings | PathSettings:
-        """Return the settings with the parameters as they are now; `track` reads them under the key `path`."""
+        """Return the settings with the present parameters; `track` reads them under the key `path`."""
         learnt = {name: float(self._value(name).detach()) for name, _ in self.named_parameters()}
         return type(self._settings)(**{**self._settings.model_dump(), **learnt})
 
@@ -82,17 +82,18 @@ class PathLayer(nn.Module):
         mask: Values | None = None,
     ) -> ShortestPath | Chosen | SoftPath:
         """Return the cheapest path (order 1), the most probable history (order 2), or probabilities (`soft`).
-        Probabilities are differentiable in all but mask and times; those of order 2 have one more place, for none.
+        Probabilities are differentiable in all but mask and times; order 2 has one more place, for no candidate.
 
         Args:
-            R_lab_body: (..., N, C, 3, 3), candidates; masked ones may hold anything.
+            R_lab_body: (..., N, C, 3, 3), candidates; arbitrary if masked.
             score: (..., N, C), quality T, 0 .. 1 (order 1), or log-likelihood of the pictures, nats (order 2).
             time_s: (..., N), increasing; frames without candidates are skipped.
-            variance_rad2: (..., N, C), of the orientations, per axis; read by order 2. None: 0.
+            variance_rad2: (..., N, C), of the orientations, per axis, for order 2. None: 0.
             mask: (..., N, C) bool, True for a candidate; None: all. Order 1 drops those below `quality_min`.
 
         Raises:
-            ShapeError: the inputs differ in frames or candidates; candidates are no rotations; times do not increase.
+            ShapeError: the inputs differ in frames or candidates; candidates are no rotations; times do not
+                increase.
             SettingsError: the temperature is not above 0.
         """
         R, time = torch.as_tensor(R_lab_body), torch.as_tensor(time_s)
@@ -111,7 +112,7 @@ class PathLayer(nn.Module):
         R = torch.where(there[..., None, None], R, unit)  # 0 times NaN would reach the gradients
         so3.check_rotations("R_lab_body", R)
         if not bool((time.diff(dim=-1) > 0).all()):
-            got, do = "times that fall, stay or are unknown", "sort the frames by time, each once"
+            got, do = "times that decrease, repeat or are NaN", "sort the frames by time, each once"
             raise ShapeError(refusal("time_s", expected="increasing times", got=got, do=do))
         score, variance = torch.where(there, score, 0.0), torch.where(there, variance, 0.0)
         if self.order == 2 and self.soft is None:
@@ -124,7 +125,7 @@ class PathLayer(nn.Module):
         return soft_path(edge, there, self.soft, node, triple)
 
     def _histories(self, R: Tensor, nll: Tensor, variance: Tensor, mask: Tensor, time_s: Tensor) -> Chosen:
-        """Search movie after movie."""
+        """Search each movie."""
         assert isinstance(self._settings, PathSettings)
         if mask.ndim == 2:
             return physical_path(R, nll, variance, mask, time_s, self._settings)
@@ -136,7 +137,7 @@ class PathLayer(nn.Module):
     def _second_order_costs(
         self, R: Tensor, score: Tensor, time_s: Tensor, variance: Tensor, mask: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the costs of edges, the mask, and the costs of candidates and triples, one place for no candidate."""
+        """Return costs of edges, mask, and costs of candidates and triples, with one more place for no candidate."""
         cost, visited = self.cost(score), mask.any(-1, keepdim=True)
         (hit_again, hit), (miss_again, miss) = cost.presence()
         right = hit - cost.picture_log_weight(-score, mask)
@@ -159,16 +160,16 @@ class PathLayer(nn.Module):
 def triple_costs(
     cost: SecondOrderCost, R_lab_body: Tensor, variance_rad2: Tensor, time_s: Tensor, mask: Tensor
 ) -> Tensor:
-    """Return the cost (..., N - 2, C, C, C), nats, of three successive candidates: how badly the third follows.
+    """Return the cost (..., N - 2, C, C, C), nats, of the third of three successive candidates after the other two.
     R_lab_body is (..., N, C, 3, 3), variance_rad2 (..., N, C) per axis (`LOST_RAD2`: unknown), time_s (..., N), mask
-    (..., N, C). Frames without candidates are skipped; rotations between frames visited are below half a turn.
+    (..., N, C). Frames without candidates are skipped; rotations between visited frames are below half a turn.
     """
     variance = cost.sigma_scale**2 * variance_rad2
     links, steps, width = _Links.of(R_lab_body, time_s, mask), mask.shape[-2], max(mask.shape[-1], 1)
     stays = _squared_chord(taken(R_lab_body, links.before, 3).flatten(-2), R_lab_body.flatten(-2))
     here = taken(variance, links.before, 1)[..., :, None]
     rest = cost.rest_variance(links.dt_s[..., None, None], here, variance[..., None, :])
-    still = _log_ratio(cost, stays, rest).amax(-2)  # (..., N, C), of each candidate if one of the frame before stays
+    still = _log_ratio(cost, stays, rest).amax(-2)  # (..., N, C), of each candidate if one of the previous frame stays
     chunk = max(1, TRIPLES_AT_ONCE // (width**3 * max(math.prod(mask.shape[:-2]), 1)))
     parts = [_chunk(cost, links, variance, still, slice(at, min(at + chunk, steps))) for at in range(2, steps, chunk)]
     none = R_lab_body.new_zeros((*mask.shape[:-2], 0, *[mask.shape[-1]] * 3))
@@ -192,24 +193,24 @@ def _chunk(cost: SecondOrderCost, links: "_Links", variance: Tensor, still: Tens
 
 
 def _log_ratio(cost: SecondOrderCost, misfit: Tensor, variance: Tensor) -> Tensor:
-    """Return the log density ratio; 0 (uniform) where the variance is too large to follow a motion."""
+    """Return the log density ratio; 0 (uniform) if the variance is too large to follow a motion."""
     return torch.where(variance < VARIANCE_MAX, cost.log_ratio(misfit, variance), 0.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Links:
-    """How each step is reached from the one visited before it."""
+    """The link of each step to the previously visited one."""
 
-    turn: Tensor  # (..., N, C, C, 3, 3), lab, from each candidate before to each here
-    dt_s: Tensor  # (..., N), the time between, 1 without a step before
-    before: Tensor  # (..., N) int64, the step visited before, 0 without one
+    turn: Tensor  # (..., N, C, C, 3, 3), lab, from each previous candidate to each present one
+    dt_s: Tensor  # (..., N), time between; 1 without a previous step
+    before: Tensor  # (..., N) int64, the previously visited step; 0: none
 
     @classmethod
     def of(cls, R_lab_body: Tensor, time_s: Tensor, mask: Tensor) -> Self:
         """Return the rotations between all candidates of successive steps; those into empty steps are arbitrary."""
         before, width = visited_before(mask), mask.shape[-1]
-        dt = time_s - time_s.gather(-1, before)  # in this order: single precision cannot separate late times
-        # One product of (3C, 3) and (3, 3C) a step, not C^2 small ones, which take ten times as long.
+        dt = time_s - time_s.gather(-1, before)  # in this order, as single precision cannot separate late times
+        # One product of (3C, 3) and (3, 3C) per step: C^2 small ones take ten times as long.
         after, first = R_lab_body.flatten(-3, -2), taken(R_lab_body, before, 3).flatten(-3, -2)
         every = (after @ first.mT).reshape(*mask.shape[:-1], width, 3, width, 3)  # (..., to, 3, from, 3)
         turn = every.permute(*range(mask.ndim - 1), -2, -4, -3, -1)
@@ -218,13 +219,13 @@ class _Links:
 
 def _squared_chord(expected: Tensor, found: Tensor) -> Tensor:
     """Return (2 sin(angle / 2))^2 between rotations (..., A, 9) and (..., B, 9): like angle^2, but smooth at pi."""
-    # Differences, not products: small misfits keep their digits in single precision.
+    # Differences, not products, keep the digits of small misfits in single precision.
     return torch.cdist(expected, found, compute_mode="donot_use_mm_for_euclid_dist").square() / 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SoftTrack:
-    """Mean poses of N frames over their candidates, NaN in frames without any; differentiable."""
+    """Mean poses of N frames over their candidates, NaN in frames without candidates; differentiable."""
 
     R_lab_body: Tensor  # (..., N, 3, 3)
     position_lab_mm: Tensor  # (..., N, 3)
@@ -241,11 +242,11 @@ def soft_track(
     turn_rad: float,
     temperature: float = 1.0,
 ) -> SoftTrack:
-    """Weigh candidates by their fit to the pictures and by the rotation from frame to frame; return their mean poses.
-    Raises ShapeError (the inputs differ in frames or candidates), SettingsError (`turn_rad` or temperature up to 0).
+    """Return the mean poses of candidates, weighted by fit to the pictures and rotation from frame to frame. Raises
+    ShapeError (the inputs differ in frames or candidates), SettingsError (`turn_rad` or temperature up to 0).
 
     Args:
-        R_lab_body: (..., N, C, 3, 3), candidates; masked ones may hold anything.
+        R_lab_body: (..., N, C, 3, 3), candidates; arbitrary if masked.
         position_lab_mm: (..., N, C, 3), of the candidates.
         misfit: (..., N, C), cost of each, such as half the mean squared residual.
         mask: (..., N, C) bool, True for a candidate.
@@ -277,8 +278,8 @@ def turning_costs(R_lab_body: Tensor, mask: Tensor, turn_rad: float) -> Tensor:
 
 def expected_orientation(R_lab_body: Tensor, marginals: Tensor) -> Tensor:
     """Return the rotation (..., N, 3, 3) with the least weighted mean squared chord to R_lab_body (..., N, C, 3, 3).
-    NaN does not count; marginals (..., N, C) are not negative; NaN where all are 0. The gradient is always finite.
-    Raises ShapeError (candidates and marginals differ in shape).
+    NaN are left out; marginals (..., N, C) are not negative; NaN if all are 0. The gradient is always finite. Raises
+    ShapeError (candidates and marginals differ in shape).
     Source: chordal mean, Hartley et al. 2013, Rotation averaging, 5.1; projected by `so3.nearest_rotation`.
     """
     check_tail("R_lab_body", R_lab_body, *marginals.shape[-1:], 3, 3)

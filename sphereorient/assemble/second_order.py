@@ -1,4 +1,4 @@
-"""The second-order path: candidates by the pictures and the change of omega; the acceleration is estimated too."""
+"""The second-order path: candidates by the pictures and the change of omega, with an estimate of the acceleration."""
 
 import math
 from collections.abc import Sequence
@@ -16,25 +16,25 @@ from sphereorient.errors import Flag
 
 VARIANCE_MIN = 1e-10  # rad^2; a smaller variance (0.0006 degrees) is rounding
 LINKS_MIN = 8  # fewer do not determine an acceleration
-ROUND_ENOUGH = 0.3  # a scale that changes by less, as a logarithm, changes no choice
-START_DEG = (0.1, 0.5, 2.0)  # changes of the rotation from frame to frame, one of which is near enough to begin with
-CHANGE_MAX_DEG = 10.0  # of the rotation from frame to frame: the largest acceleration that is tried
-SAMPLES, SAMPLE_FRAMES = 3, 100  # parts of the movie from which the start is chosen
-MOSTLY_SURE = 0.5  # share of the frames with one candidate, from which these tell the acceleration
-FLOOR_SIGMAS = 1.0  # of a single orientation: a smaller acceleration is not seen in one frame interval
+ROUND_ENOUGH = 0.3  # change of the scale's logarithm that leaves all choices unchanged
+START_DEG = (0.1, 0.5, 2.0)  # tried changes of the rotation from frame to frame, for the start
+CHANGE_MAX_DEG = 10.0  # largest tried change of the rotation from frame to frame
+SAMPLES, SAMPLE_FRAMES = 3, 100  # parts of the movie for the choice of the start
+MOSTLY_SURE = 0.5  # share of frames with one candidate from which these determine the acceleration
+FLOOR_SIGMAS = 1.0  # of a single orientation: a smaller acceleration has no effect in one frame interval
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Chosen:
-    """The most probable history of N frames; made by `PathLayer` of second order."""
+    """The most probable history of N frames, by `PathLayer` of second order."""
 
-    choice: Tensor  # (..., N) int64, index of the candidate, -1 where no candidate is right
-    probability: Tensor  # (..., N) float64, of the choice, NaN where it is -1
-    posterior: Tensor  # (..., N, C) float64, of each candidate, 0 where masked
-    turn_rad: Tensor  # (..., N, 3), lab, from the orientation before, may exceed half a turn; NaN where a motion begins
+    choice: Tensor  # (..., N) int64, index of the candidate; -1: no candidate is right
+    probability: Tensor  # (..., N) float64, of the choice; NaN if it is -1
+    posterior: Tensor  # (..., N, C) float64, of each candidate; 0 if masked
+    turn_rad: Tensor  # (..., N, 3), lab, from the previous orientation; may exceed half a turn; NaN at starts
     segment: Tensor  # (..., N) int64, -1 outside any; gaps inside a segment belong to it
     flags: Tensor  # (..., N) int64, bits of trajectory.Flag
-    acceleration_rad_s2: Tensor  # (...), scale per axis that the choice was made with; NaN without candidates
+    acceleration_rad_s2: Tensor  # (...), scale per axis of the cost; NaN without candidates
 
     @classmethod
     def nothing(cls, mask: Tensor) -> "Chosen":
@@ -62,8 +62,8 @@ def physical_path(
 ) -> Chosen:
     """Choose one candidate of each frame of a movie, or none, for the most probable history (`SecondOrderCost`).
     Candidates R (N, C, 3, 3), nll (N, C) of the pictures, variance (N, C) per axis, mask (N, C); time_s (N,) increases.
-    Flags: `AMBIGUOUS` where the choice is not sure, `RECOVERED` on the first frame with an orientation after a gap or a
-    break, `SPIKE` where a rotation does not follow from the motion.
+    Flags: `AMBIGUOUS` for an uncertain choice, `RECOVERED` on the first frame with an orientation after a gap or a
+    break, `SPIKE` for a rotation that the motion does not explain.
     Source: textbook hidden Markov model of second order; it does not favour rest as the paper does (docs/errata.md A6).
     """
     device = mask.device
@@ -118,13 +118,13 @@ def _chosen(
 
 
 def _search(rows: CandidateRows, cost: SecondOrderCost, settings: PathSettings) -> tuple[Histories, SecondOrderCost]:
-    """Search, estimate the acceleration from the best history, and repeat until it stays; a given one is kept."""
+    """Search, estimate the acceleration from the best history, and repeat until it converges; a given one is kept."""
     gap = settings.gap_frames_max
     if settings.acceleration_rad_s2 is not None:
         return BeamSearch(rows, cost, gap).run(), cost
     cost = _start(rows, cost, gap)
     histories = BeamSearch(rows, cost, gap).run()
-    for _ in range(4):  # at most
+    for _ in range(4):  # at most four rounds
         scale = _acceleration(rows, [(rows, histories)], cost)
         if abs(math.log(scale / cost.acceleration_rad_s2)) < ROUND_ENOUGH:
             break
@@ -140,8 +140,8 @@ def _bounds(rows: CandidateRows) -> tuple[float, float]:
 
 
 def _start(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> SecondOrderCost:
-    """Return the cost with the acceleration of the frames with one candidate each where most are such ones, else with
-    the one under which parts of the movie show a motion most clearly.
+    """Return the cost with the acceleration from frames with one candidate, if most frames are such, else with the one
+    that gives parts of the movie the clearest motion.
     """
     sure = _sure(rows)
     if (sure.row >= 0).mean() > MOSTLY_SURE:
@@ -164,7 +164,7 @@ def _start(rows: CandidateRows, cost: SecondOrderCost, gap_frames_max: int) -> S
 
 
 def _sure(rows: CandidateRows) -> Histories:
-    """Return the history of the frames with one candidate each: a motion through those that follow each other."""
+    """Return the history of the frames with one candidate each: a motion through consistent ones."""
     single = np.diff(rows.offset) == 1
     row = np.where(single, rows.offset[:-1], -1)
     begins = np.ones(len(row), np.bool_)
@@ -205,6 +205,6 @@ def _acceleration(
     for _ in range(50):
         distance = off**2 / ((scale * drift) ** 2 + variance)
         weight = (tail + 3) / (tail + distance)
-        # The root of the ratio, not the ratio: where errors make most of the misfit, whole steps would overshoot.
+        # The root of the ratio: if errors dominate the misfit, whole steps overshoot.
         scale = float(np.clip(scale * math.sqrt(np.mean(weight * distance) / 3), least, most))
     return scale

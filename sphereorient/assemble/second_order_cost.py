@@ -19,12 +19,12 @@ Floats = NDArray[np.float64]
 Values = TypeVar("Values", Floats, Tensor)
 
 TURNS_RAD3 = 8 * math.pi**2  # volume of SO(3) in rotation vectors' rad^3
-VARIANCE_MAX = 1.0  # rad^2; a wider density has wrapped around SO(3) and is as good as uniform
+VARIANCE_MAX = 1.0  # rad^2; a wider density is practically uniform on SO(3)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SecondOrderCost:
-    """The parameters of the cost: floats, or 0-dimensional tensors where they are learnt. Described in PathSettings."""
+    """The parameters of the cost: floats, or 0-dimensional tensors if learnt. See PathSettings."""
 
     acceleration_rad_s2: float | Tensor
     tail: float | Tensor
@@ -41,21 +41,21 @@ class SecondOrderCost:
     def of(cls, settings: PathSettings) -> "SecondOrderCost":
         """Take the parameters from settings with a number for the acceleration."""
         if settings.acceleration_rad_s2 is None:
-            do = "set it; only `track` estimates it from the movie"
+            do = "set it; only `track` estimates it"
             raise SettingsError(refusal("path.acceleration_rad_s2", expected="a number", got="null", do=do))
         return cls(**{name: getattr(settings, name) for name in PARAMETERS})
 
     def picture_log_weight(self, nll: Tensor, mask: Tensor) -> Tensor:
         """Return the log probability (..., C) of each candidate of a frame by the pictures alone; 0 where masked."""
         claimed = torch.where(mask, -self.evidence_scale * nll, -torch.inf)
-        # A frame without candidates: zeros keep the gradient clear of inf - inf.
+        # A frame without candidates: zeros, as the gradient of inf - inf is NaN.
         weight = torch.softmax(torch.where(mask.any(-1, keepdim=True), claimed, 0.0), -1)
         count = mask.sum(-1)[..., None].clamp_min(1)
         weight = (1 - self.evidence_doubt) * weight + self.evidence_doubt / count
         return torch.where(mask, weight, 1.0).log()
 
     def presence(self) -> tuple[list[Any], list[Any]]:
-        """Return the costs that a candidate is right, and that none is; index 1: one was right in the frame before."""
+        """Return the costs that a candidate is right, and that none is; index 1: one was right in the last frame."""
         each = self.miss_again_probability, self.miss_probability
         return [-_library(p).log1p(-p) for p in each], [-_library(p).log(p) for p in each]
 
@@ -76,7 +76,7 @@ class SecondOrderCost:
     ) -> Values:
         """Return the variance per axis, rad^2, of an orientation about the prediction by the mean omega of a span.
         dt_s is the step after the span, span_s its length; before, here and after are the variances per axis, rad^2, of
-        the span's first and last orientation and of the one predicted.
+        the span's first and last orientation and of the predicted one.
         """
         ratio = dt_s / span_s
         drift = self.acceleration_rad_s2 * (span_s + dt_s) / 2 * dt_s
@@ -84,15 +84,14 @@ class SecondOrderCost:
         return result
 
     def rest_variance(self, dt_s: Values, here: Values, after: Values) -> Values:
-        """Return the same for a sphere at rest; as wide as `predicted_variance` of even steps, so that both compare."""
+        """Return the variance for a sphere at rest, as wide as `predicted_variance` of even steps, for comparison."""
         result: Values = (self.acceleration_rad_s2 * dt_s**2) ** 2 + 3 * (here + after)
         return result
 
     def candidate(self, log_ratio: Values, still: Values) -> Values:
-        """Return the cost of a candidate: its log density if it is false, less that if it is right.
-        A false one stands anywhere, or stays (`still`, -inf without a frame before), or follows the motion
-        (`log_ratio`). Staying never explains better what the motion explains: otherwise noise would lose a sphere at
-        rest.
+        """Return the cost of a candidate: its log density if false, less that if right. A false candidate is anywhere,
+        or stays (`still`, -inf without a previous frame), or follows the motion (`log_ratio`). Staying never explains a
+        candidate better than the motion does: otherwise noise would lose a sphere at rest.
         """
         lib = _library(still)
         shares = 1 - self.stuck_probability - self.follow_probability, self.stuck_probability, self.follow_probability
@@ -102,7 +101,7 @@ class SecondOrderCost:
         return result
 
 
-# The keys of `PathSettings` that the cost depends on; `PathLayer` learns them.
+# The keys of `PathSettings` in the cost; `PathLayer` learns them.
 PARAMETERS = tuple(entry.name for entry in fields(SecondOrderCost))
 
 

@@ -13,28 +13,28 @@ from sphereorient.errors import Flag
 
 def links(R_lab_body: Tensor, time_s: Tensor) -> tuple[Tensor, Tensor]:
     """Return xi (rad/s), the angle over the time, and the angle (rad) of the link that enters each frame, (N,) each.
-    R_lab_body (N, 3, 3) is NaN in frames that are skipped; xi and angle are NaN without a link. time_s (N,) increases.
+    R_lab_body (N, 3, 3) is NaN in skipped frames; xi and angle are NaN without a link. time_s (N,) increases.
     Source: the paper's assembly of III, direct neighbour distance.
     """
     frame = torch.nonzero(torch.isfinite(R_lab_body[:, 0, 0]))[:, 0]
     R, turn = R_lab_body[frame], torch.full_like(R_lab_body[:, 0, 0], torch.nan)
     xi = turn.clone()
     turn[frame[1:]] = so3.geodesic_distance(R[:-1], R[1:])
-    # The times' difference in their own precision: single precision cannot separate late times.
+    # Difference in the times' own precision, as single precision cannot separate late times.
     xi[frame[1:]] = turn[frame[1:]] / time_s[frame].diff().to(R)
     return xi, turn
 
 
 def moving(values: Tensor, window: int) -> Tensor:
     """Return windows centred on each of (N,) values, (N, window); NaN beyond the ends. Even windows grow by one."""
-    half = window // 2  # padded by one more than needed: no values at all have no window
+    half = window // 2  # padded by one more than needed, for N = 0
     padded = torch.nn.functional.pad(values, (half, half + 1), value=torch.nan)
     return padded.unfold(0, 2 * half + 1, 1)[: len(values)]
 
 
 def find_spikes(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
     """Return the links (N,) bool with xi many robust deviations (MAD) above the moving median, and a large angle.
-    xi (N,), rad/s, and turn (N,), rad, belong to the link that enters each frame; xi is NaN without a link.
+    xi (N,), rad/s, and turn (N,), rad, are of the link that enters each frame; xi is NaN without a link.
     Source: the paper's assembly of III (spikes of xi), which gives no numbers.
     """
     windows = moving(xi, settings.spike_window_frames)
@@ -45,7 +45,7 @@ def find_spikes(xi: Tensor, turn: Tensor, settings: AssembleSettings) -> Tensor:
 
 
 def flags_where(bits: Mapping[Flag, Tensor]) -> Tensor:
-    """Return the flags (N,) int64 of frames by where each holds, (N,) bool."""
+    """Return the flags (N,) int64 of frames, from a mask (N,) bool for each flag."""
     return torch.stack([int(flag) * where.long() for flag, where in bits.items()]).sum(0)
 
 

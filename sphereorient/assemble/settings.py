@@ -6,13 +6,13 @@ class AssembleSettings(BaseModel, frozen=True, extra="forbid"):
 
     quality_min: float = Field(0.5, ge=0, le=1, description="least quality T of a candidate; the paper's 0.5")
     gap_frames_max: int = Field(4, ge=0, description="longest gap inside a segment, frames; the paper: under 5")
-    spike_window_frames: int = Field(41, ge=5, description="window of xi's median, frames: a few turns of velocity")
+    spike_window_frames: int = Field(41, ge=5, description="window of xi's median, frames: a few reversals of velocity")
     spike_factor: float = Field(6.0, gt=1, description="a spike is so many robust deviations (MAD) above xi's median")
     spike_min_deg: float = Field(15.0, gt=0, description="a smaller rotation is no spike, even of a sphere at rest")
-    repair_deg: float = Field(30.0, gt=0, le=180, description="cameras that differ by more are repaired; paper: 30")
+    repair_deg: float = Field(30.0, gt=0, le=180, description="least difference of cameras for a repair; paper: 30")
     repair_margin: float = Field(0.02, ge=0, description="difference of mean T that decides a repair, else continuity")
     weight_window_frames: int = Field(
-        51, ge=5, description="frames of the moving variance of xi that weighs the cameras; 50 know its ratio to 28 %"
+        51, ge=5, description="frames of the moving variance of xi, for the cameras' weights; 50 give its ratio to 28 %"
     )
 
 
@@ -30,20 +30,20 @@ class PathSettings(BaseModel, frozen=True, extra="forbid"):
         0.5, gt=0, lt=1, description="probability that no candidate is right after a frame in which none was"
     )
     break_probability: float = Field(
-        1.0e-5, gt=0, lt=1, description="probability that the motion breaks off between two frames with an orientation"
+        1.0e-5, gt=0, lt=1, description="probability that the motion breaks between two frames with an orientation"
     )
     stuck_probability: float = Field(
-        0.3, gt=0, lt=0.5, description="probability that a false candidate stands where one stood before (glare, dirt)"
+        0.3, gt=0, lt=0.5, description="probability that a false candidate repeats the previous one (glare, dirt)"
     )
     follow_probability: float = Field(
         2.0e-3, gt=0, lt=0.5, description="probability that a false candidate follows the motion (a symmetric map)"
     )
     evidence_doubt: float = Field(0.01, gt=0, lt=1, description="probability that the pictures show no right candidate")
-    evidence_scale: float = Field(1.0, gt=0, description="factor on pictures' nats; below 1 where they claim too much")
+    evidence_scale: float = Field(1.0, gt=0, description="factor on pictures' nats; below 1 if they are overconfident")
     sigma_scale: float = Field(
-        1.0, gt=0, description="factor on the sigmas that the orientations claim; above 1 where they claim too little"
+        1.0, gt=0, description="factor on the stated sigmas of orientations; above 1 if these are too small"
     )
     gap_frames_max: int = Field(16, ge=0, description="longest gap inside a segment, usual frame intervals")
     probability_min: float = Field(0.9, ge=0, le=1, description="a less probable orientation is flagged as ambiguous")
-    spike_factor: float = Field(8.0, gt=1, description="a rotation so many sigmas off the motion is a spike")
-    spike_min_deg: float = Field(10.0, gt=0, description="a rotation less far off the motion's prediction is no spike")
+    spike_factor: float = Field(8.0, gt=1, description="least deviation of a spike from the motion, sigmas")
+    spike_min_deg: float = Field(10.0, gt=0, description="least deviation of a spike from the motion's prediction")

@@ -14,7 +14,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.errors import SettingsError, ShapeError, check_tail, refusal
 
-PAIRS_AT_ONCE = 1 << 16  # candidate pairs whose 3 x 3 products are held at once, 5 MB
+PAIRS_AT_ONCE = 1 << 16  # candidate pairs with 3 x 3 products held at once, 5 MB
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -27,25 +27,25 @@ class ShortestPath:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SoftPath:
-    """Probabilities of the candidates, each path weighing exp(-cost / temperature); differentiable in all costs."""
+    """Probabilities of the candidates, with paths weighted by exp(-cost / temperature); differentiable in all costs."""
 
     free_energy: Tensor  # (...), -T log of the sum over all paths; inf without a path, 0 without candidates
     marginals: Tensor  # (..., N, C), sum 1 in steps with candidates, 0 in others and without a path
-    pair_marginals: Tensor  # (..., N - 1, C, C), of edge k into step k + 1, from the step visited last; 0 into others
+    pair_marginals: Tensor  # (..., N - 1, C, C), of edge k into step k + 1, from the last visited step; 0 into others
 
 
 def shortest_path(
     edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | None = None, triple_cost: Tensor | None = None
 ) -> ShortestPath:
-    """Find the cheapest path that visits one candidate in each step; of equal ones, that of the lowest last index.
+    """Find the cheapest path that visits one candidate in each step; of equal ones, that with the lowest last index.
     Steps without candidates are skipped: an edge into step k + 1 comes from the last step before it with candidates.
     Raises ShapeError (costs and mask differ in shape).
     Source: Bellman 1957, Viterbi 1967.
 
     Args:
         edge_cost: (..., N - 1, C, C), from row to column, inf for a wall; None: 0, with `triple_cost` only.
-        mask: (..., N, C) bool, True for a candidate; costs of masked candidates do not matter.
-        node_cost: (..., N, C), of a candidate by itself.
+        mask: (..., N, C) bool, True for a candidate; costs of masked candidates are ignored.
+        node_cost: (..., N, C), of a single candidate.
         triple_cost: (..., N - 2, C, C, C), of three candidates in the order of time; makes the order second.
     """
     order, like = _checked(edge_cost, mask, node_cost, triple_cost)
@@ -55,14 +55,14 @@ def shortest_path(
     start, edges = _laid_out(like, edge_cost, node_cost, triple_cost, mask)
     visited, width, older = mask.any(-1), mask.shape[-1], mask.shape[-1] ** (order - 1)
     total, origins = start, []
-    for edge, here in _steps(edges.detach(), visited, order):  # a recursion: each step needs the one before
+    for edge, here in _steps(edges.detach(), visited, order):  # recursive in the steps
         arriving = total.unsqueeze(-1) + edge
-        # Not min(): it wakes all threads for the smallest tensor, which on busy cores takes ten times as long.
+        # Not min(): it starts all threads even for small tensors, ten times slower on busy cores.
         origin = arriving.argmin(-order - 1)
         arrived = arriving.gather(-order - 1, origin.unsqueeze(-order - 1)).squeeze(-order - 1)
         total = torch.where(here, arrived, total)
         origins.append((origin.flatten(-order), here.flatten(-order)))
-    # A state (i, j) has the number i C + j. Of equal ones the last is that of the lowest j, then of the lowest i.
+    # A state (i, j) has the number i C + j. Of equal ones, the lowest j is taken, then the lowest i.
     end = total.reshape(*total.shape[: total.ndim - order], older, width).mT.flatten(-2).argmin(-1, keepdim=True)
     walk = [end % older * width + end // older]
     for origin, here in reversed(origins):
@@ -83,13 +83,13 @@ def soft_path(
     node_cost: Tensor | None = None,
     triple_cost: Tensor | None = None,
 ) -> SoftPath:
-    """Weigh all paths by exp(-cost / temperature), temperature > 0; the other arguments are those of `shortest_path`.
+    """Weigh all paths by exp(-cost / temperature), temperature > 0; other arguments as in `shortest_path`.
     Raises ShapeError (costs and mask differ in shape), SettingsError (the temperature is not above 0).
     Source: Baum and others 1970 (forward-backward); Mensch and Blondel 2018, Differentiable dynamic programming.
     """
     order, like = _checked(edge_cost, mask, node_cost, triple_cost)
     if not 0 < temperature < torch.inf:
-        do = "for temperature 0 take the shortest path"
+        do = "for temperature 0 use the shortest path"
         raise SettingsError(refusal("temperature", expected="a number above 0", got=str(temperature), do=do))
     if 0 in mask.shape[-2:]:
         pairs = like.new_zeros((*mask.shape[:-2], max(mask.shape[-2] - 1, 0), *[mask.shape[-1]] * 2))
@@ -98,14 +98,14 @@ def soft_path(
     free, links = _all_paths(start, edges, mask.any(-1), order, temperature)
     blocked = free >= _wall(free) / 2
     links = torch.where(blocked[..., None, None, None], 0.0, links.sum(-3) if order == 2 else links)
-    second = (mask.any(-1).cumsum(-1) > 1)[..., None, None]  # no edge enters the first step visited
+    second = (mask.any(-1).cumsum(-1) > 1)[..., None, None]  # no edge enters the first visited step
     pairs = torch.where(second, links, 0.0)[..., 1:, :, :]
     free_energy = torch.where(blocked, torch.inf, free)
     return SoftPath(free_energy=free_energy, marginals=links.sum(-2), pair_marginals=pairs)
 
 
 def visited_before(mask: Tensor) -> Tensor:
-    """Return the last step before each one with candidates in a mask (..., N, C), (..., N) int64; 0 without one."""
+    """Return the last step with candidates in a mask (..., N, C) before each step, (..., N) int64; 0: none."""
     step = torch.arange(mask.shape[-2], device=mask.device)
     held = torch.where(mask.any(-1), step, 0).cummax(-1).values if len(step) else mask[..., 0].long()
     return torch.cat([torch.zeros_like(held[..., :1]), held[..., :-1]], -1)
@@ -124,7 +124,7 @@ def _all_paths(start: Tensor, edges: Tensor, visited: Tensor, order: int, temper
     for edge, here in _steps(edges, visited, order):
         arrived = -temperature * torch.logsumexp((total.unsqueeze(-1) + edge) / -temperature, axis)
         total = torch.where(here, arrived, total)
-        # Only differences count: less each step's least total, long movies keep their digits in single precision.
+        # Subtract each step's least total: long movies keep their digits in single precision.
         level = total.detach().amin(state, keepdim=True)
         total = total - level
         totals.append(total)
@@ -154,12 +154,12 @@ def _laid_out(
     first = torch.arange(width, device=mask.device) == 0
 
     def rows(cost: Tensor, back: int) -> Tensor:
-        """Return the cost that enters each step; 0 where fewer than `back` steps are visited before."""
+        """Return the cost that enters each step; 0 if fewer than `back` steps were visited before."""
         led = torch.nn.functional.pad(cost, (*[0, 0] * (back + 1), steps - cost.shape[-back - 2], 0))
         return torch.where((rank > back)[(..., *[None] * (back + 1))], led, 0.0)
 
     def places_before(here: Tensor) -> Tensor:
-        """Return the places (..., N, C) of the step visited last, `first` where there is none."""
+        """Return the places (..., N, C) of the last visited step, `first` if there is none."""
         begun = torch.nn.functional.pad(rank, (1, -1)) > 0
         return torch.where(begun[..., None], taken(here, last, 1), first)
 
@@ -171,7 +171,7 @@ def _laid_out(
         edges = rows(triple_cost, 2) + edges[..., None, :, :]
         there = places_before(before)[..., :, None, None] & there[..., None, :, :]
     edges = torch.where(there, edges, torch.inf)
-    # Finite walls: differences of infinities would be NaN. Costs are far smaller.
+    # Finite walls, far above costs: differences of infinities are NaN.
     state = edges.shape[mask.ndim - 1 : -1]
     start = edges.new_full((math.prod(state),), _wall(edges))
     start[0] = 0.0
@@ -185,7 +185,7 @@ def _wall(like: Tensor) -> float:
 def _checked(
     edge_cost: Tensor | None, mask: Tensor, node_cost: Tensor | None, triple_cost: Tensor | None
 ) -> tuple[int, Tensor]:
-    """Raise where costs do not fit the mask; return the order of the path, and costs of the dtype that counts."""
+    """Raise if costs do not fit the mask; return the order of the path, and costs in their common dtype."""
     order, like = (1, edge_cost) if triple_cost is None else (2, triple_cost)
     if like is None:
         raise ShapeError(refusal("edge_cost", expected="costs of edges or triples", got="none", do="pass one of them"))
@@ -201,8 +201,8 @@ def _checked(
 def edge_costs(R_lab_body: Tensor, score: Tensor, time_s: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return the paper's cost d(A, B) (2 - T_A - T_B) / dt, rad/s, from each candidate (row) to each of the next step.
     Shapes: R_lab_body (..., N, C, 3, 3), score T (..., N, C), increasing time_s (..., N), result (..., N - 1, C, C).
-    With a mask (..., N, C), each edge comes from the last step before it with candidates.
-    Raises ShapeError (the inputs differ in steps or candidates).
+    With a mask (..., N, C), each edge comes from the last step before it with candidates. Raises ShapeError (the inputs
+    differ in steps or candidates).
     Source: the paper's assembly of III; a standstill costs nothing (docs/errata.md A6).
     """
     check_tail("R_lab_body", R_lab_body, 3, 3)
@@ -210,14 +210,14 @@ def edge_costs(R_lab_body: Tensor, score: Tensor, time_s: Tensor, mask: Tensor |
     check_tail("time_s", time_s, *score.shape[-2:-1])
     mask = torch.ones_like(score, dtype=torch.bool) if mask is None else mask
     last, time_s = visited_before(mask)[..., 1:], time_s.expand(score.shape[:-1])
-    dt = time_s[..., 1:] - taken(time_s, last, 0)  # in this order: single precision cannot separate late times
+    dt = time_s[..., 1:] - taken(time_s, last, 0)  # in this order, as single precision cannot separate late times
     turn = turns_over_gaps(R_lab_body, mask)
     doubt = 2 - taken(score, last, 1)[..., :, None] - score[..., 1:, None, :]
     return turn * doubt / dt.to(turn)[..., None, None]
 
 
 def turns_over_gaps(R_lab_body: Tensor, mask: Tensor) -> Tensor:
-    """Return the angles (..., N - 1, C, C), rad, between candidates (..., N, C, 3, 3) and those of the next step.
+    """Return the angles (..., N - 1, C, C), rad, from candidates (..., N, C, 3, 3) to those of the next step.
     Each comes from the last step before it with candidates in the mask (..., N, C).
     """
     last, width = visited_before(mask)[..., 1:], mask.shape[-1]

@@ -1,5 +1,5 @@
-"""The paper's paths: of one camera, chosen by `PathLayer` of first order; of several cameras of one sphere, with repair
-of frames where they disagree, and the weighted mean on SO(3).
+"""The paper's paths: of one camera, by `PathLayer` of first order; of several cameras of one sphere, with repair of
+frames in which they disagree, and the weighted mean on SO(3).
 """
 
 import math
@@ -19,14 +19,14 @@ from sphereorient.search import Candidates
 
 Graph = Sequence[Tensor]  # R (N, C, 3, 3), score (N, C), mask (N, C)
 CHI2_3_MEDIAN = 2.366  # median of a sum of three squared standard normals
-LINKS_MIN = 3  # in the window; fewer give no variance worth the name
-VARIANCE_RANGE = 10.0  # a quiet stretch of xi is no proof of a perfect camera
-CAMERAS_RATIO_MAX = 100.0  # of typical variances: a track whose xi never changes is not infinitely good
+LINKS_MIN = 3  # least links in the window; fewer give no usable variance
+VARIANCE_RANGE = 10.0  # limits the weight of a camera with a quiet stretch of xi
+CAMERAS_RATIO_MAX = 100.0  # of typical variances: limits the weight of a track with constant xi
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Track:
-    """Orientations of one camera in N frames, NaN where it has none."""
+    """Orientations of one camera in N frames, NaN if it has none."""
 
     R_lab_body: Tensor  # (N, 3, 3)
     score: Tensor  # (N,)
@@ -41,30 +41,30 @@ class Track:
         return Track(R_lab_body=self.R_lab_body[frames], score=self.score[frames])
 
     def with_part(self, frames: Tensor, other: "Track") -> "Track":
-        """Return the track with some frames from another one."""
+        """Return the track with some frames of another one."""
         R = self.R_lab_body.index_copy(0, frames, other.R_lab_body)
         return Track(R_lab_body=R, score=self.score.index_copy(0, frames, other.score))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Path(Track):
-    """Chosen orientations of one camera in N frames; xi and spike of a link stand at the frame that it enters."""
+    """Chosen orientations of one camera in N frames; xi and spike of a link belong to the frame that it enters."""
 
     choice: Tensor  # (N,) int64, row within the frame's candidates; -1 without any
     xi: Tensor  # (N,), rad/s, angle over time of the link that enters the frame; NaN without a link
-    spike: Tensor  # (N,) bool, that link is a spike
+    spike: Tensor  # (N,) bool, whether that link is a spike
     segment: Tensor  # (N,) int64, -1 outside any
 
 
 def assemble_paths(candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings) -> dict[str, Path]:
-    """Return the path of each camera, as `assemble_path`."""
+    """Return the path of each camera by `assemble_path`."""
     return {name: assemble_path(each, time_s, settings, name) for name, each in candidates.items()}
 
 
 def assemble_path(candidates: Candidates, time_s: Tensor, settings: AssembleSettings, name: str = "") -> Path:
     """Choose one candidate of each frame of a camera, by the least cost over the whole movie; time_s (N,) increases.
     Frames without candidates of `quality_min` are skipped: the cost of the link over them is divided by its time.
-    Raises ShapeError (another number of frames than there are times).
+    Raises ShapeError (numbers of frames and times differ).
     Source: the paper's assembly of III (directed graph between direct neighbours); docs/errata.md A6.
     """
     if len(candidates) != len(time_s):
@@ -83,7 +83,7 @@ def assemble_path(candidates: Candidates, time_s: Tensor, settings: AssembleSett
 
 
 def graph_of(candidates: Candidates, quality_min: float) -> Graph:
-    """Return the candidates of one camera that may be chosen: R (N, C, 3, 3), score (N, C) and mask (N, C)."""
+    """Return the usable candidates of one camera: R (N, C, 3, 3), score (N, C) and mask (N, C)."""
     R, score, mask = candidates.padded()
     return R, score, mask & (score >= quality_min)
 
@@ -92,23 +92,23 @@ def graph_of(candidates: Candidates, quality_min: float) -> Graph:
 class Fused:
     """The orientation of the sphere in N frames from all cameras."""
 
-    R_lab_body: Tensor  # (N, 3, 3), NaN where no camera has one
-    sigma_rad: Tensor  # (N,), standard deviation per axis; NaN where not measurable
+    R_lab_body: Tensor  # (N, 3, 3), NaN if no camera has one
+    sigma_rad: Tensor  # (N,), standard deviation per axis; NaN if not measurable
     segment: Tensor  # (N,) int64, -1 outside any
     flags: Tensor  # (N,) int64, bits of trajectory.Flag
-    weight: Mapping[str, Tensor]  # (N,) of each camera, its share in the mean, of sum 1; 0 without any orientation
+    weight: Mapping[str, Tensor]  # (N,) of each camera, its share in the mean, sum 1; 0 without any orientation
     repaired: Mapping[str, Tensor]  # (N,) bool of each camera
-    R_lab_body_of: Mapping[str, Tensor]  # (N, 3, 3) of each camera after the repair, NaN where missing
+    R_lab_body_of: Mapping[str, Tensor]  # (N, 3, 3) of each camera after the repair, NaN if missing
 
 
 def fuse(
     paths: Mapping[str, Path], candidates: Mapping[str, Candidates], time_s: Tensor, settings: AssembleSettings
 ) -> Fused:
     """Fuse the paths of the cameras, in the lab frame, into one; `time_s` (N,).
-    Stretches that differ by more than `repair_deg` are repaired, of more than two cameras by majority where there is
-    one. Then each frame is the mean of all, weighted by the inverse moving variance of xi; their differences give the
-    sigma, so that one camera alone has none. Flags: `ONE_CAMERA`, and `AMBIGUOUS` for an undecided repair.
-    Raises ExperimentError (no camera), ShapeError (paths, candidates and times differ in cameras or frames).
+    Stretches that differ by more than `repair_deg` are repaired, for more than two cameras by majority if there is one.
+    Then each frame is the mean of all, weighted by the inverse moving variance of xi. Their differences give the sigma;
+    a single camera has none. Flags: `ONE_CAMERA`, and `AMBIGUOUS` for an undecided repair. Raises ExperimentError (no
+    camera), ShapeError (paths, candidates and times differ in cameras or frames).
     Source: the paper's two cameras; docs/errata.md A7 (which camera is right), A8 (xi contains the motion's variance).
     """
     _check(paths, candidates, time_s)
@@ -119,7 +119,7 @@ def fuse(
     linked = [links(track.R_lab_body, time_s) for track in tracks]
     variance = relative_variance([xi for xi, _ in linked], settings)
     spikes = [moving(find_spikes(xi, turn, settings).to(xi), settings.weight_window_frames) for xi, turn in linked]
-    calm = torch.stack([window.nansum(-1) == 0 for window in spikes]).all(0)  # no spike raises the variance
+    calm = torch.stack([window.nansum(-1) == 0 for window in spikes]).all(0)  # without spikes, which raise the variance
     weight = torch.where(present, 1 / variance, 0.0)
     total = weight.sum(0)
     share = weight / torch.where(total > 0, total, 1.0)
@@ -140,8 +140,8 @@ def fuse(
 
 
 def relative_variance(xi: Sequence[Tensor], settings: AssembleSettings) -> Tensor:
-    """Return the moving variance (K, N) of each camera's xi (N,), above 0; only ratios between cameras have a meaning.
-    It is clamped about the camera's median, which replaces it where fewer than `LINKS_MIN` links are near.
+    """Return the moving variance (K, N) of each camera's xi (N,), above 0, meaningful only as ratios between cameras.
+    It is clamped about the camera's median, which replaces it if fewer than `LINKS_MIN` links are near.
     """
     windows = [moving(each, settings.weight_window_frames) for each in xi]
     count = torch.stack([torch.isfinite(window).sum(-1) for window in windows])
@@ -149,7 +149,7 @@ def relative_variance(xi: Sequence[Tensor], settings: AssembleSettings) -> Tenso
     variance = torch.where(count >= LINKS_MIN, squares / (count - 1).clamp_min(1), torch.nan)
     typical = variance.nanmedian(-1, keepdim=True).values if variance.shape[1] else variance.new_ones(len(xi), 1)
     largest = typical.nan_to_num(0.0).max()
-    # All cameras at rest or without links: no camera is preferred.
+    # All cameras at rest or without links: equal weights.
     typical = torch.where(typical.isnan() | (largest == 0), torch.where(largest > 0, largest, 1.0), typical)
     typical = typical.clamp_min(typical.max() / CAMERAS_RATIO_MAX)
     within = torch.minimum(torch.maximum(variance, typical / VARIANCE_RANGE), typical * VARIANCE_RANGE)
@@ -157,7 +157,7 @@ def relative_variance(xi: Sequence[Tensor], settings: AssembleSettings) -> Tenso
 
 
 def _mean(tracks: Sequence[Track], share: Tensor) -> Tensor:
-    """Return the weighted mean (N, 3, 3) of the cameras; with one camera exactly its orientation; NaN without any."""
+    """Return the weighted mean (N, 3, 3) of the cameras; of one camera exactly its orientation; NaN without any."""
     present = torch.stack([track.present for track in tracks])[..., None, None]
     R = torch.stack([track.R_lab_body for track in tracks])
     view = torch.eye(3, dtype=R.dtype, device=R.device)
@@ -169,7 +169,7 @@ def _mean(tracks: Sequence[Track], share: Tensor) -> Tensor:
 
 
 def _apart(first: Track, second: Track) -> Tensor:
-    """Return the angle (N,), rad, between two cameras' orientations; NaN without both."""
+    """Return the angle (N,), rad, between two cameras' orientations; NaN if one is missing."""
     apart = so3.geodesic_distance(first.R_lab_body, second.R_lab_body)
     return torch.where(first.present & second.present, apart, torch.nan)
 
@@ -196,7 +196,7 @@ def _check(paths: Mapping[str, Path], candidates: Mapping[str, Candidates], time
         frames = len(candidates[name]) if name in candidates else 0
         if not len(path.choice) == frames == len(time_s):
             expected, got = f"{len(time_s)} frames", f"{len(path.choice)} in the path, {frames} in the candidates"
-            do = "pass what assemble_paths was given and gave"
+            do = "pass the input and output of assemble_paths"
             raise ShapeError(refusal(f"camera {name!r}", expected=expected, got=got, do=do))
 
 
@@ -206,12 +206,12 @@ class Repair:
 
     tracks: tuple[Track, ...]
     repaired: Tensor  # (C, N) bool, replaced by the candidate nearest to another camera
-    ambiguous: Tensor  # (N,) bool, the choice of the right camera was not decided by T
+    ambiguous: Tensor  # (N,) bool, T did not decide which camera is right
 
 
 def repair_all(paths: Sequence[Path], graphs: Sequence[Graph], settings: AssembleSettings) -> Repair:
-    """Repair the frames in which cameras disagree. Where more than half of three or more agree with one of them, the
-    others take their candidates nearest to that one, none (T = 0) beyond `repair_deg`. Others: see `repair`.
+    """Repair the frames in which cameras disagree. If more than half of three or more agree with one of them, the
+    others take their candidates nearest to it, none (T = 0) beyond `repair_deg`. Else: see `repair`.
     """
     if len(paths) == 2:
         return repair((paths[0], paths[1]), (graphs[0], graphs[1]), settings)
@@ -220,7 +220,7 @@ def repair_all(paths: Sequence[Path], graphs: Sequence[Graph], settings: Assembl
     there = torch.stack([path.present for path in paths])
     near = torch.stack([torch.stack([_apart(one, other) <= limit for other in paths]) for one in paths])
     score = torch.stack([path.score.nan_to_num(0.0) for path in paths])
-    leader = (near.sum(1) + 0.5 * score.clamp(0, 1)).argmax(0)  # with most on its side; of equals the better one
+    leader = (near.sum(1) + 0.5 * score.clamp(0, 1)).argmax(0)  # with most agreement; of equals the better one
     sided = near[leader, :, frames].T  # (C, N)
     decided = (there.sum(0) > 2) & (2 * sided.sum(0) > there.sum(0))
     repaired, ambiguous = torch.zeros_like(there), torch.zeros_like(decided)
@@ -240,7 +240,7 @@ def repair_all(paths: Sequence[Path], graphs: Sequence[Graph], settings: Assembl
 
 
 def _only(path: Path, track: Track, where: Tensor) -> Path:
-    """Return a path with the orientations of a track in some frames, where (N,) bool, and none elsewhere."""
+    """Return a path with the orientations of a track in the frames `where` (N,) bool, and none elsewhere."""
     R = torch.where(where[:, None, None], track.R_lab_body, torch.nan)
     return replace(path, R_lab_body=R, score=torch.where(where, track.score, torch.nan))
 
@@ -248,10 +248,10 @@ def _only(path: Path, track: Track, where: Tensor) -> Path:
 def repair(paths: tuple[Path, Path], graphs: tuple[Graph, Graph], settings: AssembleSettings) -> Repair:
     """Repair each stretch (`_stretches`) in which the cameras disagree; the better supported camera leads.
     Each camera in turn is assumed right; the other takes its nearest candidates, none (T = 0) beyond `repair_deg`. The
-    larger mean T of both cameras decides. Within `repair_margin`, or without such candidates, the leader with the
-    smaller largest rotation holds, and the frames are ambiguous.
-    A segment of the loser that the leader contradicts wherever it sees the sphere is dropped where the leader does not.
-    Source: the paper's two cameras, which does not say which camera is right; docs/errata.md A7.
+    larger mean T of both cameras decides. Within `repair_margin`, or without such candidates, the camera with the
+    smaller largest rotation leads, and the frames are ambiguous. A segment of the loser that the leader contradicts
+    wherever it sees the sphere is dropped where the leader does not see it.
+    Source: the paper's two cameras, which does not state which camera is right; docs/errata.md A7.
     """
     limit = math.radians(settings.repair_deg)
     apart, segment = _apart(*paths), torch.stack([path.segment for path in paths])
@@ -283,7 +283,7 @@ def repair(paths: tuple[Path, Path], graphs: tuple[Graph, Graph], settings: Asse
 
 def _stretches(apart: Tensor, segment: Tensor, limit: float) -> list[Tensor]:
     """Return the frames of each stretch in which the cameras disagree; segment (2, N) of each camera alone.
-    A piece lies between spikes or gaps of either camera. It is one stretch if its median distance exceeds the limit:
+    A piece lies between spikes or gaps of either camera. It is one stretch if its median distance exceeds the limit, as
     after a spike the whole path may be false. In other pieces each run of frames beyond the limit is a stretch.
     """
     seen = torch.nonzero(torch.isfinite(apart))[:, 0]

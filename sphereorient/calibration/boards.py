@@ -21,15 +21,15 @@ from sphereorient.calibration.targets import (
 from sphereorient.errors import refusal
 
 LEAST_CORNERS = 6  # of a ChArUco board: fewer hardly determine a homography
-WINDOW = 0.3  # half a window of the sub-pixel step, in distances to the nearest corner: it holds no other corner
+WINDOW = 0.3  # half the window of the sub-pixel step, in distances to the nearest corner, so that it holds no other
 SHARP = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
 
 
 def see_plate(
     picture: NDArray[np.generic], plate: CalibrationTarget, name: str = "plate picture", clicked: Floats | None = None
 ) -> PlateView:
-    """Find `plate` in a grey picture (H, W), any number type (or CameraError); `refused` with a reason if unusable.
-    `clicked`: about where the fiducials of a plate of dots are, see `index_dots`.
+    """Find `plate` in a grey picture (H, W) of any number type; `refused` with a reason if unusable. Or CameraError.
+    `clicked`: approximate fiducials of a plate of dots, see `index_dots`.
     """
     if isinstance(plate, targets.Chessboard):
         return _chessboard(picture, plate, name)
@@ -42,7 +42,7 @@ def see_plate(
 
 
 def _chessboard(picture: NDArray[np.generic], board: targets.Chessboard, name: str) -> PlateView:
-    """Find all inner corners of a chessboard; floating where the board has a rotational symmetry."""
+    """Find all inner corners of a chessboard; floating if the board has a rotational symmetry."""
     grey = _eight_bits(picture)
     found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=SHARP)
     if not found:
@@ -69,14 +69,14 @@ def _charuco(picture: NDArray[np.generic], board: targets.CharucoBoard, name: st
         got = f"{count} corners, {0 if markers is None else len(markers)} markers of {board.dictionary}"
         do = "show more of the board, or correct columns, rows, dictionary or legacy_pattern"
         return refused_view(name, expected, got, do)
-    # OpenCV 4 leaves these half a pixel off. The markers stay outside of the windows.
+    # OpenCV 4's corners are off by half a pixel. The windows exclude the markers.
     clear = min(WINDOW, (1 - board.marker_mm / board.pitch_mm) / 2)
     uv_px = _refined(grey, np.asarray(corners).reshape(-1, 2).astype(np.float64), clear)
     return seen(board, index, uv_px, np.full(count, SIGMA_PX))
 
 
 def _circles(picture: NDArray[np.generic], grid: targets.CircleGrid, name: str) -> PlateView:
-    """Find and measure all circles by `find_dots`; OpenCV only orders them."""
+    """Find and measure all circles by `find_dots`; OpenCV gives only their order."""
     dots = find_dots(picture, dark=grid.dark)
     order = _circles_in_order(dots, grid)
     if order is None:
@@ -93,8 +93,8 @@ def _circles(picture: NDArray[np.generic], grid: targets.CircleGrid, name: str) 
 
 
 def _placed_one_of(turns: Ints, view: PlateView, plate: CalibrationTarget, name: str) -> PlateView:
-    expected, got = "a plate that looks the same from one side only", f"{len(turns)} possible rotations"
-    do = "tie it through the other camera, or use a plate with marks"
+    expected, got = "a plate without rotational symmetry", f"{len(turns)} possible rotations"
+    do = "show the same pose to a camera that identifies it, or use a plate with marks"
     return view.settled(plate, turns, refusal(name, expected=expected, got=got, do=do))
 
 
@@ -125,7 +125,7 @@ def _homography(index: Floats | Ints, uv_px: Floats) -> Floats:
 
 
 def _seen_from_front(index: Ints, uv_px: Floats) -> Ints:
-    """Reverse the rows where OpenCV counts as if the target were seen from behind."""
+    """Reverse the rows if OpenCV numbers the target as seen from behind."""
     h = _homography(index - index.mean(axis=0), uv_px)
     # Determinant of the Jacobian: v runs down, so from the front it is negative.
     slope = h[:2, :2] / h[2, 2] - np.outer(h[:2, 2], h[2, :2]) / h[2, 2] ** 2
@@ -157,7 +157,7 @@ def _circles_in_order(dots: Dots, grid: targets.CircleGrid) -> Ints | None:
         return None
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if grid.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
     points = dots.uv_px.astype(np.float32).reshape(-1, 1, 2)
-    find: Any = cv2.findCirclesGrid  # without a blob detector it takes points, which its types do not say
+    find: Any = cv2.findCirclesGrid  # without a blob detector it takes points, missing in its types
     for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
         found, centres = find(points, (grid.columns, grid.rows), flags, None, cv2.CirclesGridFinderParameters())
         if found:

@@ -19,13 +19,13 @@ from sphereorient.cameras.checks import check_points
 from sphereorient.cameras.parameters import ROTATION, TRANSLATION, parameter_names, with_parameters
 
 POSE_PARTS = len(ROTATION) + len(TRANSLATION)  # of a plate pose: rad, lab, and mm
-HELD = ("pixel_pitch_u", "pixel_pitch_v", "sx", "k3")  # scales that f already has, and a term that few lenses need
+HELD = ("pixel_pitch_u", "pixel_pitch_v", "sx", "k3")  # scales that f covers, and a term that few lenses need
 SOFT = 2.0  # sigmas beyond which the loss of a residual grows linearly
 OUTLIER = 6.0  # robust standard deviations beyond which a point is left out
 RIM_POINTS = 8  # of each disk; terms beyond the second order of the rim are negligible
 ROUNDS = 3  # of fit, perspective bias and outliers
 STEPS = 60  # at most, a round
-GAIN = (1e-5, 1e-8)  # relative gain of the cost at which a round ends: all rounds but the last, and the last
+GAIN = (1e-5, 1e-8)  # relative gain of the cost at which a round ends: of all rounds but the last; of the last
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,7 +48,7 @@ class Rig:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SeenPoints:
-    """The n points of the plate that one camera saw in all pictures."""
+    """The n points of the plate that one camera saw, from all pictures."""
 
     pose: Tensor  # (n,) int64, row of the rig's poses
     points_plate_mm: Tensor  # (n, 3)
@@ -67,7 +67,7 @@ def gathered(views: Mapping[int, PlateView]) -> SeenPoints:
 
 
 def fitted_parameters(camera: Camera, of_port: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the names of the fitted parameters: lens, pose, and of the port those in `of_port`."""
+    """Return the names of the fitted parameters: lens, pose, and those of the port in `of_port`."""
     return (*(name for name in parameter_names(in_air(camera)) if name not in HELD), *of_port)
 
 
@@ -139,7 +139,7 @@ class Problem:
         return torch.cat(parts)
 
     def split(self, change: Tensor) -> tuple[dict[str, Tensor], Tensor]:
-        """Return the shares of a vector (size,) of each camera, and those of all poses, (P, 6)."""
+        """Return each camera's part of a vector (size,), and the part of all poses, (P, 6)."""
         lengths = [len(names) for names in self.names.values()]
         *shares, poses = torch.split(change, [*lengths, POSE_PARTS * len(self.free)])
         whole = change.new_zeros(len(self.rig.R_lab_plate), POSE_PARTS)
@@ -172,7 +172,7 @@ class Fitted:
 
 
 def adjust(problem: Problem) -> Fitted:
-    """Fit cameras and poses from a start that places each dot nearest to its own image.
+    """Fit cameras and poses from a start that is near enough to assign each dot to its own image.
     The covariance is the inverse information times the variance of the residuals.
     Source: Triggs et al. 2000 (bundle adjustment); soft L1 loss, Huber 1981.
     """

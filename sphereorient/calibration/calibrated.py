@@ -1,4 +1,4 @@
-"""The result of a calibration, as lines and tables too, and what contradicts it."""
+"""The result of a calibration, also as lines and tables, and signs that it is wrong."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -18,9 +18,9 @@ from sphereorient.cameras import Camera, ParameterCovariance, PortCamera, in_air
 from sphereorient.cameras.parameters import PORT_NUMBERS, TRANSLATION
 
 NEIGHBOURS = 4  # of a point on the plate
-SHARED = 0.1  # share of the residuals' variance common to neighbours from which it is structure, beside 4 sigma
-FINE_PX = 0.01  # structure below it does no harm
-DROPPED, DROPPED_HERE = 0.05, 0.2  # share of the points of a camera, or of one picture, from which it counts
+SHARED = 0.1  # share of the residuals' variance common to neighbours that counts as structure, above 4 sigma
+FINE_PX = 0.01  # smaller structure is harmless
+DROPPED, DROPPED_HERE = 0.05, 0.2  # least share of dropped points, of a camera or of one picture, that is reported
 OFF_CENTRE = 0.1  # of the picture's longer side
 FIELD_DEG = (1.0, 150.0)  # of view, along the longer side
 
@@ -34,7 +34,7 @@ class PictureReport:
     view: PlateView
     residual_px: NDArray[np.float64]  # (n, 2), measured minus expected
     used: NDArray[np.bool_]  # (n,), False for outliers
-    reason: str  # why it was not used; empty where it was
+    reason: str  # why it was not used; empty if used
 
     @property
     def lost(self) -> int:
@@ -57,7 +57,7 @@ class Calibrated:
     T_lab_plate_mm: Tensor  # (P, 3)
     pictures: tuple[PictureReport, ...]
     scale: float  # residuals over their expected standard deviations
-    verdict: tuple[str, ...] = ()  # what contradicts the calibration, one line each
+    verdict: tuple[str, ...] = ()  # signs of a wrong calibration, one line each
 
     def rms_px(self, camera: str) -> float:
         """Rms distance between one camera's measured and expected points."""
@@ -71,15 +71,15 @@ def _rms_px(pictures: Sequence[PictureReport]) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Doubt:
-    """What contradicts one camera."""
+    """Signs of a wrong calibration of one camera."""
 
     words: tuple[str, ...]
-    structured: bool  # neighbouring points miss alike: the model is incomplete
-    hopeless: bool  # by more than the noise, and many points were dropped
+    structured: bool  # residuals of neighbouring points are correlated: the model is incomplete
+    hopeless: bool  # structure exceeds the noise, and many points were dropped
 
 
 def doubts(result: Calibrated) -> dict[str, Doubt]:
-    """Return the cameras that something contradicts."""
+    """Return the doubtful cameras."""
     found = {name: _doubt(result, name) for name in result.cameras}
     return {name: doubt for name, doubt in found.items() if doubt.words}
 
@@ -94,7 +94,7 @@ def _doubt(result: Calibrated, name: str) -> Doubt:
     structured = structure > FINE_PX and share > SHARED + 2 / math.sqrt(points)  # of noise, sigma is 0.5 / sqrt(points)
     words = []
     if structured:
-        words.append(f"neighbouring points miss alike, by {structure:.3f} px rms beside {noise:.3f} px of noise")
+        words.append(f"residuals of neighbouring points agree, {structure:.3f} px rms beside {noise:.3f} px of noise")
     if dropped:
         most = f"{worst.lost} of {len(worst.used)} in {worst.picture.path.name}"
         words.append(f"{lost} of {points} points were dropped, {most}")
@@ -103,7 +103,7 @@ def _doubt(result: Calibrated, name: str) -> Doubt:
 
 
 def _shared(pictures: Sequence[PictureReport]) -> float:
-    """Return the share of the residuals' variance that neighbouring points have in common, 0 to 1."""
+    """Return the share of the residuals' variance that is common to neighbouring points, 0 to 1."""
     common = total = 0.0
     for one in pictures:
         missed, points = one.residual_px[one.used], one.view.points_plate_mm[one.used]
@@ -120,7 +120,7 @@ def _lens_words(camera: Camera) -> list[str]:
     unsure = max((sigma for name, sigma in sigmas.items() if name.startswith("c")), default=0.0)
     off = math.dist(lens.centre_px.tolist(), [(size - 1) / 2 for size in camera.image_size])
     field = math.degrees(2 * math.atan(longer / 2 / float(lens.focal_px[1])))
-    words = [f"the lens's centre lies {off:.0f} px off the picture's"] if off - 3 * unsure > OFF_CENTRE * longer else []
+    words = [f"the principal point is {off:.0f} px off the middle"] if off - 3 * unsure > OFF_CENTRE * longer else []
     return words if FIELD_DEG[0] < field < FIELD_DEG[1] else [*words, f"its field of view is {field:.3g} degrees"]
 
 
@@ -137,7 +137,7 @@ def parameters_table(result: Calibrated) -> Table:
 
 
 def _values(camera: Camera) -> dict[str, float]:
-    """Return the fitted numbers of lens and wall, and T; of the rotation only sigmas are meaningful."""
+    """Return the fitted numbers of lens, wall and T; for the rotation, only sigmas are meaningful."""
     known = () if camera.covariance is None else camera.covariance.names
     lens = in_air(camera)
     fields = lens.parameter_fields().items()
@@ -149,7 +149,7 @@ def _values(camera: Camera) -> dict[str, float]:
 
 
 def pictures_table(result: Calibrated) -> Table:
-    """Return one row for each picture: points, outliers and rms, or why it was not used."""
+    """Return a row for each picture: points, outliers and rms, or why it was not used."""
     numbers = (Column(name, justify="right") for name in ("points", "outliers", "rms px"))
     table = Table("pose", "camera", "picture", *numbers, "not used because", title="pictures")
     for one in sorted(result.pictures, key=lambda one: (one.pose, one.picture.camera)):

@@ -1,6 +1,4 @@
-"""What each camera alone says of the sphere, by how much the cameras differ, and what may be wrong where they
-contradict each other: causes of few parameters, which are fitted robustly.
-"""
+"""Disagreement of the cameras about the sphere, each measured alone, and its likely causes of few parameters."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,13 +16,13 @@ from sphereorient import so3
 from sphereorient.calibration.targets import Floats
 from sphereorient.cameras import Camera, R_lab_view, Rays, centre_lab_mm, sphere_radius_px, triangulate
 
-RUNS, RUN = 3, 20  # causes are tried in some runs of frames that follow each other
-STRETCH = 0.01  # by how much outlines may be wider than high, where nothing is wrong
-GAP_PX, TURN_DEG, SIZE = 1.0, 0.2, 0.01  # by which cameras that agree may differ, in any light
-TURN_SIGMAS, EDGE_PX = 3.0, 0.2  # and where the rotation is less well known, or the sphere is small: px of the radius
+RUNS, RUN = 3, 20  # number and length of the runs of consecutive frames in which causes are tried
+STRETCH = 0.01  # allowed relative excess of an outline's width over its height
+GAP_PX, TURN_DEG, SIZE = 1.0, 0.2, 0.01  # allowed differences of agreeing cameras, in any light
+TURN_SIGMAS, EDGE_PX = 3.0, 0.2  # the same for uncertain rotations, and for small spheres: px of the radius
 NAN = torch.tensor(torch.nan, dtype=torch.float64)
-Sight = tuple[Rays, Tensor]  # what one camera says of N frames: lines of sight, and R_lab_body (N, 3, 3)
-LATEST = 8  # frames by which a movie may be late
+Sight = tuple[Rays, Tensor]  # of one camera in N frames: lines of sight, and R_lab_body (N, 3, 3)
+LATEST = 8  # largest tested delay of a movie, frames
 PLAUSIBLE = 0.2  # largest deviation: relative, rad, 100 mm
 FIT: dict[str, Any] = {"loss": "soft_l1", "x_scale": 0.01, "max_nfev": 30}
 FLIPS = {"horizontal": (0,), "vertical": (1,), "both": (0, 1)}  # axes of the picture
@@ -32,7 +30,7 @@ FLIPS = {"horizontal": (0,), "vertical": (1,), "both": (0, 1)}  # axes of the pi
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """How far apart cameras that agree may be, in any light: typical values of a movie."""
+    """Allowed differences of agreeing cameras, in any light: typical values of a movie."""
 
     gap_px: float
     turn_deg: float
@@ -41,29 +39,29 @@ class Limits:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Seen:
-    """What each of C cameras alone says of N frames; NaN where it says nothing."""
+    """Measurements by each of C cameras alone in N frames; NaN if there are none."""
 
     cameras: Mapping[str, Camera]
     centre_px: Tensor  # (N, C, 2)
     radius_px: Tensor  # (N, C), of the sphere's picture, along the camera's x
     R_lab_body: Tensor  # (N, C, 3, 3)
-    diameter_mm: float = 1.0  # without it only ratios of sizes between cameras count
-    outline_stretch: Tensor = NAN  # (N, C) or (): by how much outlines are wider than the cameras say, relative
-    frame: Tensor | None = None  # (N,) int64, increasing, at even times; None: no camera is tested for being late
+    diameter_mm: float = 1.0  # without it only ratios of sizes between cameras matter
+    outline_stretch: Tensor = NAN  # (N, C) or (): relative excess of an outline's width over the cameras' prediction
+    frame: Tensor | None = None  # (N,) int64, increasing, at even times; None: delays are not tested
 
     @classmethod
     def of_outlines(cls, cameras: Mapping[str, Camera], centre_px: Tensor, radius_px: Tensor) -> "Seen":
-        """Return what outlines (N, C, 2), (N, C), px, alone say."""
+        """Return the measurements by outlines (N, C, 2), (N, C), px, alone."""
         R = torch.full((*radius_px.shape, 3, 3), torch.nan, dtype=torch.float64)
         return cls(cameras=cameras, centre_px=centre_px, radius_px=radius_px, R_lab_body=R)
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
-        """The cameras in pairs."""
+        """All pairs of cameras."""
         return list(combinations(range(len(self.cameras)), 2))
 
     def gaps(self, pair: tuple[int, int], centre_px: Tensor | None = None) -> "Gaps":
-        """Return the gaps of two cameras, with other centres (N, C, 2), px, if these are given."""
+        """Return the gaps of two cameras, with other centres (N, C, 2), px, if given."""
         pixels, cameras = self.centre_px if centre_px is None else centre_px, list(self.cameras.values())
         return gaps_between([cameras[k] for k in pair], [pixels[:, k] for k in pair])
 
@@ -73,7 +71,7 @@ class Gaps:
     """Distances between the lines of sight to n points; made by `gaps_between`."""
 
     signed_mm: Tensor  # (n,), along the common perpendicular; NaN where a point is missing
-    per_mm_px: Tensor  # (n,), px of the first camera for a millimetre along it
+    per_mm_px: Tensor  # (n,), px in the first camera per millimetre along it
     position_lab_mm: Tensor  # (n, 3), the middle of the shortest segment
     across_lab: Tensor  # (n, 3), unit, the common perpendicular
 
@@ -99,7 +97,7 @@ def gaps_between(cameras: Sequence[Camera], centre_px: Sequence[Tensor]) -> Gaps
 
 
 def _meet(a: Rays, b: Rays) -> tuple[Tensor, Tensor, Tensor]:
-    """Return where lines of sight meet (n, 3), their signed gap (n,), mm, and its unit direction (n, 3), lab."""
+    """Return points nearest to two lines of sight (n, 3), signed gap (n,), mm, and its direction (n, 3), unit, lab."""
     position, _ = triangulate(a, b)
     across = torch.linalg.cross(a.direction_lab, b.direction_lab)
     across = across / across.norm(dim=-1, keepdim=True)
@@ -108,14 +106,14 @@ def _meet(a: Rays, b: Rays) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def limits_of(seen: Seen, covariance_rad2: Tensor) -> Limits:
-    """Return how far apart cameras that agree may be; covariance (N, C, 3, 3) of each camera's rotation."""
+    """Return the allowed differences of agreeing cameras; covariance (N, C, 3, 3) of each camera's rotation."""
     sigma_deg = math.degrees(float(so3.trace(covariance_rad2).sqrt().nanmedian().nan_to_num(posinf=0.0)))
     turn_deg = max(TURN_DEG, math.sqrt(2) * TURN_SIGMAS * sigma_deg)
     return Limits(gap_px=GAP_PX, turn_deg=turn_deg, size=max(SIZE, EDGE_PX / float(seen.radius_px.nanmedian())))
 
 
 class Comparison:
-    """Measures by how much the cameras would differ if they had seen something else than they say."""
+    """Computes the differences between the cameras for measured or changed observations."""
 
     def __init__(self, seen: Seen, limits: Limits) -> None:
         rows = torch.nonzero(torch.isfinite(seen.centre_px).all(-1).sum(-1) > 1)[:, 0]
@@ -143,7 +141,7 @@ class Comparison:
         return far
 
     def sights(self, centre_px: Tensor | None = None, R_view_body: Tensor | None = None) -> list[Sight]:
-        """Return what the cameras say of centres (N, C, 2), px, and attitudes (N, C, 3, 3); None: those seen."""
+        """Return lines of sight and rotations of centres (N, C, 2), px, and attitudes (N, C, 3, 3); None: measured."""
         pixels = (self.centre_px if centre_px is None else centre_px).unbind(1)
         attitudes = (self.R_view_body if R_view_body is None else R_view_body).unbind(1)
         each = zip(self.cameras, pixels, attitudes, strict=True)
@@ -152,9 +150,9 @@ class Comparison:
     def __call__(
         self, sights: Sequence[Sight], larger: Tensor | float = 0.0, sized: bool = True, wider: Tensor | float = 0.0
     ) -> Tensor:
-        """Return gap, turn (3), log sizes (2) and stretches (2) of pairs and frames, (P, N, 8), in units of limits.
-        `larger`: logarithm of the factor by which pictures of the sphere are larger than the cameras say, () or (C,);
-        `wider`: by how much wider than high, relative, () or (C,).
+        """Return gap, rotation (3), log sizes (2) and stretches (2) of pairs and frames, (P, N, 8), in units of limits.
+        `larger`: logarithm of the ratio of measured to predicted size of the sphere's picture, () or (C,); `wider`:
+        relative excess of width over height, () or (C,).
         """
         stretch = self.stretch - wider
         growth = torch.as_tensor(larger, dtype=torch.float64).expand(len(self.names))
@@ -171,7 +169,7 @@ class Comparison:
 
 
 def typical(found: Tensor) -> Tensor:
-    """Return the typical gap, turn, and size that is farthest from the expected one, of each pair, (P, 3)."""
+    """Return the typical gap, rotation, and size farthest from the expected one, of each pair, (P, 3)."""
     gap, turn, size = found[..., 0].abs(), found[..., 1:4].norm(dim=-1), found[..., 4:6]
     middle = size.nanmedian(1).values.nan_to_num()
     farthest = middle.gather(1, middle.abs().argmax(1, keepdim=True))
@@ -179,25 +177,25 @@ def typical(found: Tensor) -> Tensor:
 
 
 def misfit(found: Tensor) -> float:
-    """Return the median over frames of the mean square of what was measured (P, N, K), mean of pairs; NaN without."""
+    """Return the median over frames of the mean square of differences (P, N, K), mean of pairs; NaN without."""
     return float(found.square().nanmean(-1).nanmedian(1).values.nanmean())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cause:
-    """What would explain a contradiction."""
+    """A possible cause of a contradiction."""
 
-    words: str  # with its size, and what to do
+    words: str  # cause, its size, and what to do
     left: float = math.inf  # share of the misfit that it leaves
     parameters: int = 0
-    deadly: bool = False  # nothing can be measured before it is corrected
-    cameras: tuple[int, ...] = ()  # that it blames
+    deadly: bool = False  # no measurement is possible before it is corrected
+    cameras: tuple[int, ...] = ()  # affected
 
 
 def other_readings(
     cameras: Mapping[str, Camera], centre_px: Tensor, R_view_body: Tensor, flips: Sequence[str] = tuple(FLIPS)
 ) -> Iterator[tuple[Cause, Tensor, Tensor]]:
-    """Yield causes, centres (N, C, 2), px, and attitudes (N, C, 3, 3) with two movies swapped, or one flipped."""
+    """Yield causes, centres (N, C, 2), px, and attitudes (N, C, 3, 3) for two swapped movies, or one flipped."""
     names, sizes = list(cameras), [camera.image_size for camera in cameras.values()]
     for k, m in combinations(range(len(names)), 2):
         if sizes[k] == sizes[m]:
@@ -215,7 +213,7 @@ def other_readings(
 
 
 def likely_causes(compare: Comparison, found: Tensor) -> Iterator[Cause]:
-    """Yield what may be wrong, with the share that it leaves of the misfit of what was `found`, (P, N, 8)."""
+    """Yield likely causes, each with the remaining share of the misfit of the differences `found`, (P, N, 8)."""
     names, whole = compare.names, misfit(found)
     cameras = dict(zip(names, compare.cameras, strict=True))
     for cause, centre_px, R in other_readings(cameras, compare.centre_px, compare.R_view_body, ["both"]):
@@ -233,7 +231,7 @@ def likely_causes(compare: Comparison, found: Tensor) -> Iterator[Cause]:
         best: Any = least_squares(residuals, np.zeros(count), bounds=bounds, **FIT)
         return Cause(words=words.format(*numbers(best.x)), left=misfit(measured(best.x)) / whole, parameters=count)
 
-    words = f"sphere.diameter {mm:.4g} explains the pictures if it is {{:.4g}}, or the calibration's lengths are off"
+    words = f"the pictures fit sphere.diameter {{:.4g}}, not {mm:.4g}: measure it, or check the calibration's lengths"
     yield fitted(lambda p: compare(sights, larger=float(p[0])), 1, words, lambda p: [mm * math.exp(p[0])])
     for some in [each, *([k] for k in each)]:
         words = f"pixels of {' and '.join(names[k] for k in some)} {{:+.1f}} % wider than calibrated: check sx, "
@@ -242,19 +240,19 @@ def likely_causes(compare: Comparison, found: Tensor) -> Iterator[Cause]:
         yield replace(wide, cameras=tuple(some))
     for k, name in enumerate(names):
         for count, moved in ((3, ""), (6, " and moved by {:.2g} mm")):
-            words = f"{name} turned by {{:.2g}} degrees{moved} since its calibration: calibrate again"
+            words = f"{name} rotated by {{:.2g}} degrees{moved} since its calibration: calibrate again"
             yield replace(fitted(partial(_moved, compare, k), count, words, _turn_and_move), cameras=(k,))
     if compare.frame is not None:
         yield from _late(compare, compare.frame, whole)
 
 
 def _turn_and_move(p: Floats) -> list[float]:
-    """Return the turn, degrees, and the move, mm, of the parameters of `_moved`."""
+    """Return rotation, degrees, and displacement, mm, of the parameters of `_moved`."""
     return [math.degrees(float(np.linalg.norm(p[:3]))), 100 * float(np.linalg.norm(p[3:]))]
 
 
 def _wide(compare: Comparison, some: Sequence[int], p: Floats) -> Tensor:
-    """Pixels wider than high; the circle about the picture is half as much too large."""
+    """Return differences with pixels wider than high; the outline's circle is larger by half of that."""
     pixels, larger = compare.centre_px.clone(), torch.zeros(len(compare.names), dtype=torch.float64)
     for k in some:
         middle = 0.5 * (compare.cameras[k].image_size[0] - 1)
@@ -264,7 +262,7 @@ def _wide(compare: Comparison, some: Sequence[int], p: Floats) -> Tensor:
 
 
 def _moved(compare: Comparison, camera: int, p: Floats) -> Tensor:
-    """The camera turned about its centre by p[:3], rad, lab, and moved by p[3:], in 100 mm."""
+    """Return differences with a camera rotated about its centre by p[:3], rad, lab, and moved by p[3:], in 100 mm."""
     turn, sights = so3.exp(torch.from_numpy(p[:3])), compare.sights()
     rays, R = sights[camera]
     origin = rays.origin_lab_mm + 100 * torch.from_numpy(p[3:] if len(p) > 3 else np.zeros(3))
@@ -273,9 +271,9 @@ def _moved(compare: Comparison, camera: int, p: Floats) -> Tensor:
 
 
 def _late(compare: Comparison, frame: Tensor, whole: float) -> Iterator[Cause]:
-    """Each movie some frames late; between frames all is interpolated."""
+    """Yield the delay of each movie; between frames, measurements are interpolated."""
     shifts = np.arange(-LATEST, LATEST + 0.5, 0.5)
-    # Of two the first one sets the time; of more the others do.
+    # With two movies the first one sets the time; with more, the others do.
     for k, name in list(enumerate(compare.names))[len(compare.names) == 2 :]:
         left = [misfit(compare(_shifted(compare, k, frame, float(shift)))) / whole for shift in shifts]
         if np.isnan(left).all():
@@ -286,7 +284,7 @@ def _late(compare: Comparison, frame: Tensor, whole: float) -> Iterator[Cause]:
 
 
 def _shifted(compare: Comparison, camera: int, frame: Tensor, late: float) -> list[Sight]:
-    """Return what the cameras say if one shows each frame `late` frames later."""
+    """Return the observations if a movie shows each frame `late` frames later."""
     sights = compare.sights()
     rays, R = sights[camera]
     first = math.floor(late)

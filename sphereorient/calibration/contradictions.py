@@ -1,4 +1,4 @@
-"""The one judgement of whether cameras agree: in a whole movie, with likely causes, and frame by frame."""
+"""Whether cameras agree: in a whole movie, with likely causes, and frame by frame."""
 
 import math
 from collections.abc import Mapping
@@ -26,21 +26,21 @@ from sphereorient.errors import Flag, Reason
 from sphereorient.so3 import hat, log, solve_damped
 from sphereorient.trajectory import Trajectory
 
-FEWEST = 3  # frames from which cameras are judged
-EXPLAINS = 0.3  # a cause leaves at most this share of the misfit
-EQUALLY = 2.0  # causes that leave at most this many times the least are named as well
+FEWEST = 3  # least number of frames for a comparison
+EXPLAINS = 0.3  # largest share of the misfit left by a cause
+EQUALLY = 2.0  # causes that leave at most this many times the least misfit are named too
 SIMPLER = 0.5  # a cause of fewer parameters is preferred if its misfit, in units of the limits, is below this
-OUTLINES = Limits(gap_px=1.5, turn_deg=1.0, size=0.01)  # of outlines alone: they jump where paint is dark
-ELSEWHERE = [str(Reason.CONTRADICTS), str(Reason.SECOND_BALL)]  # a camera that measures the sphere at another place
+OUTLINES = Limits(gap_px=1.5, turn_deg=1.0, size=0.01)  # for outlines alone: dark paint makes them jump
+ELSEWHERE = [str(Reason.CONTRADICTS), str(Reason.SECOND_BALL)]  # of a camera that sees the sphere elsewhere
 OWN = ("centre_px", "radius_px", "orientation", "orientation_cov")  # of each camera of a track
-CONTRADICTS_SIGMAS = 5.0  # of the difference of what two cameras say alone: no noise
+CONTRADICTS_SIGMAS = 5.0  # of the difference of two cameras alone: above, it is not noise
 
 
 @dataclass(frozen=True, kw_only=True)
 class Consistency:
-    """Typical disagreement of cameras, and its causes, likeliest first; made by `compare_cameras`."""
+    """Typical disagreement of cameras, and its causes, likeliest first."""
 
-    frames: int  # with two cameras; nothing is judged below `FEWEST`
+    frames: int  # with two cameras; no verdict below `FEWEST`
     gap_px: float = math.nan  # between the lines of sight
     turn_deg: float = math.nan  # between the attitudes
     size: float = math.nan  # measured over expected, less 1, of the camera where it is farthest from 0
@@ -66,14 +66,14 @@ class Consistency:
 
 
 def compare_cameras(seen: Seen, limits: Limits) -> Consistency:
-    """Compare the cameras in pairs; where they contradict each other, find the causes that leave least."""
+    """Compare the cameras in pairs; if they contradict each other, find the causes with the least misfit."""
     compare = Comparison(seen, limits)
     found = compare(compare.sights())
     count = int(torch.isfinite(found[..., 0]).sum(1).amax()) if len(found) else 0
     if count < FEWEST:
         return Consistency(frames=count)
     usual = typical(found)
-    usual = usual.gather(0, usual.nan_to_num().abs().argmax(0, keepdim=True))[0]  # of the pair that is farthest apart
+    usual = usual.gather(0, usual.nan_to_num().abs().argmax(0, keepdim=True))[0]  # of the most different pair
     known = Consistency(
         frames=count,
         gap_px=limits.gap_px * float(usual[0]),
@@ -95,9 +95,9 @@ def compare_cameras(seen: Seen, limits: Limits) -> Consistency:
 
 
 def majority(seen: Seen, limits: Limits = OUTLINES) -> tuple[int, ...]:
-    """Return the largest set of cameras of which each two agree, if these are more than half of three or more; or none.
-    Of sets of one size that whose lines of sight and sizes agree best: where two cameras alone measure a direction, the
-    size of the picture in another, which looks along it, decides.
+    """Return the largest set of cameras that agree in pairs, if it is more than half of three or more; else ().
+    Among sets of one size, that with the best agreement of lines of sight and sizes. Sizes decide along a direction
+    that two cameras alone measure: a camera that looks along it shows it as size.
     """
     if len(seen.cameras) < 3:
         return ()
@@ -110,7 +110,7 @@ def _majority(compare: Comparison, found: Tensor) -> tuple[int, ...]:
     if not found.shape[1]:
         return ()
     gap, turn, size = typical(found).unbind(1)
-    agree = (gap <= 1) & (turn.nan_to_num(0.0) <= 1)  # without paint in view no turn is known
+    agree = (gap <= 1) & (turn.nan_to_num(0.0) <= 1)  # without paint in view the rotation is unknown
     worse = torch.where(agree, gap.square() + size.square(), torch.inf)
     apart = dict(zip(compare.pairs, worse.tolist(), strict=True))
     for several in range(count, count // 2, -1):
@@ -125,7 +125,7 @@ def _majority(compare: Comparison, found: Tensor) -> tuple[int, ...]:
 def said_alone(
     track: Trajectory, cameras: Mapping[str, Camera], diameter_mm: float, consecutive: bool
 ) -> tuple[Seen, Limits]:
-    """Return what each camera of a track alone says, and how far apart cameras that agree may be."""
+    """Return the measurements by each camera of a track alone, and the allowed differences."""
     centre_px, radius_px, R, covariance = (_of_cameras(track, name) for name in OWN)
     seen = Seen(cameras=cameras, centre_px=centre_px, radius_px=radius_px, R_lab_body=R, diameter_mm=diameter_mm)
     return replace(seen, frame=torch.arange(len(track)) if consecutive else None), limits_of(seen, covariance)
@@ -138,11 +138,11 @@ def with_contradictions(
     consecutive: bool,
     lasting_rad2: Tensor | float = 0.0,
 ) -> tuple[Trajectory, Consistency]:
-    """Mark frames in which two cameras contradict each other, and make the covariances hold what they disagree by.
-    The rotation errors that last in each camera, `lasting_rad2` (C, 3, 3), let them disagree without a contradiction. A
-    camera that contradicts more others than it has on its side takes no part.
-    A contradiction is added to those of its frame; all are scaled where cameras disagree more than they state in most
-    frames. Return also how well the cameras agree in the whole movie.
+    """Mark frames in which two cameras contradict each other, and add their disagreement to the covariances.
+    Rotation errors that last in each camera, `lasting_rad2` (C, 3, 3), allow disagreement without a contradiction. A
+    camera that contradicts more others than agree with it is not used. A contradiction widens the covariances of its
+    frame. All covariances are scaled if cameras disagree more than stated in most frames. Return also how well the
+    cameras agree in the whole movie.
     """
     seen, limits = said_alone(track, cameras, diameter_mm, consecutive)
     elsewhere = np.stack([np.isin(one.reason, ELSEWHERE) for one in track.cameras.values()], 1)
@@ -169,16 +169,16 @@ def with_contradictions(
     place_cov, turn_cov = scaled["position_cov"], scaled["orientation_cov"]
     share = 1 / torch.from_numpy(believed).clamp_min(2).to(torch.float64)
     for pair in pairs:
-        # The mean of two is off by half of the contradiction if either is wrong, a single one by all of it.
+        # If either camera is wrong, the error is half the contradiction for a mean, all of it for one camera.
         turn = torch.where(pair.both, share, 1.0)[:, None] * pair.turned[:, None] * pair.turn.nan_to_num()
         gap_mm = torch.where(pair.both, share, 0.5) * pair.gaps.signed_mm.nan_to_num()
         gap_mm = gap_mm * (pair.apart > CONTRADICTS_SIGMAS * place_scale)
         shift_mm = (pair.gaps.position_lab_mm - torch.from_numpy(track.position)).nan_to_num()
         shift_mm = torch.where(pair.both[:, None], 0.0, shift_mm)
-        # A pose between two pictures turns the sphere to match their paint; one camera's own pose does not.
+        # A pose between two pictures is rotated to match their paint; one camera's own pose is not.
         rolled = torch.where(pair.both, gap_mm, 0.0)[:, None] / (diameter_mm / 2)
         for whole, off in ((turn_cov, turn), (turn_cov, rolled), (place_cov, gap_mm[:, None]), (place_cov, shift_mm)):
-            # In all directions: that of the error is not known as well as its size.
+            # In all directions: the direction of the error is less certain than its size.
             whole += off.square().sum(-1)[:, None, None] * unit
     flags = track.flags | np.where(wrong.numpy() & track.valid, np.uint32(Flag.CONTRADICTION), np.uint32(0))
     stated: dict[str, Any] = {name: whole.numpy() for name, whole in scaled.items()}
@@ -186,8 +186,8 @@ def with_contradictions(
 
 
 def _rolls_by_move(track: Trajectory, cameras: Mapping[str, Camera], radius_mm: float) -> Tensor:
-    """Return the turn (N, C, 3, 3), rad/mm, by which a sphere that is moved shows each camera the same paint, weighted
-    so that squares add up to their mean over the cameras that count. A move along the line of sight turns nothing.
+    """Return the rotation (N, C, 3, 3), rad/mm, that keeps the same paint in each camera's view of a moved sphere,
+    weighted so that squares add up to their mean over the cameras in use. It is 0 along the line of sight.
     """
     X, count = torch.from_numpy(track.position), torch.from_numpy(track.believed)
     sight = torch.stack([X - centre_lab_mm(camera) for camera in cameras.values()], 1)
@@ -197,9 +197,9 @@ def _rolls_by_move(track: Trajectory, cameras: Mapping[str, Camera], radius_mm: 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Compared:
-    """What two cameras alone say of each frame, compared; distances in units of what they state, NaN: unknown."""
+    """Differences between two cameras alone in each frame; distances in units of stated errors, NaN: unknown."""
 
-    both: Tensor  # (N,) bool, both are believed
+    both: Tensor  # (N,) bool, both are used
     turn: Tensor  # (N, 3), rad, from the second camera's rotation to the first one's
     away: Tensor  # (N,), Mahalanobis distance of the rotations
     gaps: Gaps
@@ -215,7 +215,7 @@ def _compared(track: Trajectory, seen: Seen, lasting_rad2: Tensor | float, k: in
     spread = (_of_cameras(track, "orientation_cov") + lasting_rad2)[:, [k, m]].sum(1)
     turn, gaps = log(seen.R_lab_body[:, k] @ seen.R_lab_body[:, m].mT), seen.gaps((k, m))
     across, known = gaps.across_lab[..., None], torch.from_numpy(np.nan_to_num(track.position_systematic_cov))
-    # Two lines of sight that are known equally well are apart by twice the deviation of their middle.
+    # The gap of two equally certain lines of sight has twice the deviation of their middle.
     variance = 4 * (across.mT @ known @ across)[:, 0, 0]
     for c in (k, m):
         sigma = _of_cameras(track, "centre_sigma_px") / seen.radius_px
@@ -230,13 +230,13 @@ def _compared(track: Trajectory, seen: Seen, lasting_rad2: Tensor | float, k: in
 
 
 def _excess(distance: Tensor, dimensions: int) -> float:
-    """Return the rms of distances (n,) over the expected one, at least 1; without those of over five medians."""
+    """Return the rms of distances (n,) over the expected one, at least 1; distances above five medians are left out."""
     kept = distance[distance <= CONTRADICTS_SIGMAS * distance.nanmedian()]
     return max(1.0, float((kept.square().mean() / dimensions).sqrt().nan_to_num(1.0)))
 
 
 def _of_cameras(track: Trajectory, name: str) -> Tensor:
-    """Return a dataset of all cameras, (N, C, ...); NaN where a camera has no orientation."""
+    """Return a dataset of all cameras, (N, C, ...); NaN for a camera without an orientation."""
     whole = np.stack([getattr(camera, name) for camera in track.cameras.values()], 1)
     whole[np.isnan([camera.orientation[:, 0, 0] for camera in track.cameras.values()]).T] = np.nan
     return torch.from_numpy(whole)

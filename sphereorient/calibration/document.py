@@ -28,7 +28,7 @@ COLUMNS = ("x", "y", "z", "u", "v")  # mm, mm, mm, px, px
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 _Triple = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 ModelName = Literal["tsai", "pinhole", "brown"]
-# Points of tables are lab points: a plate whose frame is the lab's.
+# Points of tables are lab points, as on a plate whose frame is the lab.
 IN_THE_LAB = {0: (torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))}
 
 
@@ -41,7 +41,7 @@ class SurveyedKeys(Entry):
 
 
 class PictureKeys(BaseModel, frozen=True, extra="allow"):
-    """One pose: its number, the picture of each camera, and where its fiducials were clicked."""
+    """One pose: its number, the picture of each camera, and its clicked fiducials."""
 
     __pydantic_extra__: dict[str, str]
     pose: StrictInt
@@ -59,7 +59,7 @@ class CalibrationKeys(BaseModel, frozen=True, extra="forbid"):
     pictures: list[PictureKeys] = []
     points: dict[str, str] = {}
     model: ModelName = "tsai"
-    fit_ports: tuple[str, ...] = ()  # names of the ports' parameters that are fitted too
+    fit_ports: tuple[str, ...] = ()  # parameters of the ports to fit
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,7 +69,7 @@ class Photo:
     camera: str
     row: int  # of the pose
     path: Path
-    clicked_px: NDArray[np.float64] | None = None  # (2 or 3, 2), about where the fiducials are, in the plate's order
+    clicked_px: NDArray[np.float64] | None = None  # (2 or 3, 2), approximate fiducials, in the plate's order
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -151,7 +151,7 @@ def _ports(keys: CalibrationKeys, path: Path, cameras: tuple[str, ...]) -> dict[
     where = f"{path}, fit_ports"
     check_known(keys.fit_ports, (*PORT_NUMBERS, *PORT_TILT), where)
     if keys.fit_ports and not keys.ports:
-        do = "write under `ports` where the walls are, as well as you know"
+        do = "write under `ports` approximately where the walls are"
         raise camera_error(where, "ports to fit", "none", do)
     if len(set(keys.fit_ports)) < len(keys.fit_ports):
         raise camera_error(where, "different names", ", ".join(keys.fit_ports), "name each once")
@@ -178,8 +178,8 @@ def _pictures(keys: CalibrationKeys, path: Path, numbers: tuple[int, ...]) -> It
 
 
 def checked_clicks(points: Any, image_size: tuple[int, int], where: str) -> NDArray[np.float64]:
-    """Return clicked fiducials, two or three pairs u, v, px, of the origin, on +x and on +y, as an array (2 or 3, 2);
-    CameraError for another number of them or places outside a picture of `image_size` (W, H).
+    """Return clicked fiducials (two or three pairs u, v, px: the origin, on +x, on +y) as an array (2 or 3, 2);
+    CameraError for another number, or points outside a picture of `image_size` (W, H).
     """
     do, clicked = "click them again, or remove the points", np.zeros((0, 0))
     with suppress(TypeError, ValueError):
@@ -188,7 +188,7 @@ def checked_clicks(points: Any, image_size: tuple[int, int], where: str) -> NDAr
         raise camera_error(where, f"two or three pairs u, v: {', '.join(FIDUCIALS)}", short(points), do)
     for name, uv_px in zip(FIDUCIALS, clicked, strict=False):
         if not ((uv_px >= -0.5) & (uv_px <= np.array(image_size) - 0.5)).all():
-            expected = f"a place inside {image_size[0]} x {image_size[1]} px"
+            expected = f"a point inside {image_size[0]} x {image_size[1]} px"
             raise camera_error(f"{where}, {name}", expected, f"{uv_px.tolist()}", do)
     return clicked
 

@@ -13,12 +13,12 @@ from sphereorient.calibration.targets import Floats, Ints
 from sphereorient.cameras.checks import camera_error
 
 RING = 1.8  # radii up to which the background is fitted: less than half way to the next dot on usual plates
-LEAST_RING_PX = 2.5  # beyond the rim at least, for dots of few pixels
+LEAST_RING_PX = 2.5  # least width beyond the rim, for small dots
 OTHERS = 1.5  # radii within which pixels belong to another dot
 STEPS = 12  # of Levenberg and Marquardt, before and again after robust weights
-SETTLED = 1e-7  # part of the cost below which a further gain moves a centre by less than 0.001 of its sigma
+SETTLED = 1e-7  # part of the cost; a smaller gain moves a centre by less than 0.001 of its sigma
 PARAMETERS = 10  # centre 2, shape 3, blur 1, light 3, contrast 1
-LEAST_BLUR_PX = 0.2  # a rim is never sharper than its pixels make it (0.29)
+LEAST_BLUR_PX = 0.2  # the pixels alone blur a rim by 0.29
 _Chain = list[tuple[Floats, Floats, float]]  # centre, shape and area of a blob, one for each grey level
 
 
@@ -29,7 +29,7 @@ class Dots:
     uv_px: Floats  # (n, 2), centres of the ellipses
     shape: Floats  # (n, 2, 2), 1/px^2: x^T shape x = 1 on the rim, x from the centre
     sigma_px: Floats  # (n,), standard deviation of each of u and v, from the fit
-    contrast: Floats  # (n,), share of the light that is missing in the dark part, 0 .. 1
+    contrast: Floats  # (n,), share of light missing in the dark part, 0 .. 1
     misfit: Floats  # (n,), rms of the picture around the fitted dot, relative to its contrast
 
     def __len__(self) -> int:
@@ -50,7 +50,7 @@ class DotSettings:
 
     levels: int = 32  # thresholds at which blobs are searched; a dot must be seen at three or more
     smooth_px: float = 0.8  # sigma of the smoothing before the search (noise)
-    smallest_area_px: float = 8.0  # below it a dot has too few pixels for its ellipse
+    smallest_area_px: float = 8.0  # a smaller dot has too few pixels for its ellipse
     largest_part: float = 0.2  # longest side of a dot, as part of the picture's shorter side
     faintest: float = 0.4  # least contrast of a dot, as part of that of the strongest ones in the picture
     worst_misfit: float = 0.12  # rms of the picture around the fitted dot, noise included, as part of its contrast
@@ -58,7 +58,7 @@ class DotSettings:
 
 def find_dots(picture: NDArray[np.generic], *, dark: bool = True, settings: DotSettings = DotSettings()) -> Dots:
     """Find dots wholly inside a grey picture (H, W) of any number type and measure their centres, from top to bottom.
-    `dark` dots lie on a bright background; uneven light needs no setting. CameraError for other pictures or NaN.
+    `dark`: dark dots on a bright background. CameraError for another shape, or NaN.
     """
     grey = as_grey(picture)
     centre, shape = _blobs(grey if dark else -grey, settings)
@@ -71,7 +71,7 @@ def find_dots(picture: NDArray[np.generic], *, dark: bool = True, settings: DotS
         good = inside & (fit.misfit < settings.worst_misfit) & (fit.contrast > 0.1) & (moved < 0.5)
         good &= np.isfinite(fit.sigma_px) & (fit.area_px >= settings.smallest_area_px)
     if good.any():
-        # Noise can look like faint dots; dots of one plate have the same contrast in any light.
+        # Noise may form faint dots; dots of one plate have equal contrast in any light.
         good &= fit.contrast > settings.faintest * np.percentile(fit.contrast[good], 95)
     good &= _first_of_equals(fit.uv_px, fit.shape, good)
     kept = np.flatnonzero(good)
@@ -125,7 +125,7 @@ def _blobs(grey: NDArray[np.float32], settings: DotSettings) -> tuple[Floats, Fl
 def _ellipses_at(
     mask: NDArray[np.bool_], settings: DotSettings
 ) -> tuple[NDArray[np.int32], dict[int, int], Floats, Floats, Floats]:
-    """Return labels of the mask's components; number, area, centre and shape of the ellipses among them."""
+    """Return labels of the mask's components; of the ellipses among them the number, area, centre and shape."""
     height, width = mask.shape
     pieces: Any = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     labels, stats = pieces[1], pieces[2]
@@ -185,7 +185,7 @@ def half_box(shape: Floats) -> Floats:
 
 
 def _owners(size: tuple[int, ...], centre_px: Floats, shape: Floats) -> NDArray[np.int32]:
-    """Return the dot of each pixel (H, W), -1 for the background; where dots overlap, the first wins."""
+    """Return the dot of each pixel (H, W), -1 for the background; if dots overlap, the first one."""
     owner = np.full(size, -1, dtype=np.int32)
     box = OTHERS * half_box(shape)
     for k in range(len(centre_px) - 1, -1, -1):
@@ -224,7 +224,7 @@ class _Windows:
         rim = _Rim(x, y, shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1])
         owned = owner[v_in, u_in]
         used = seen & ((rim.q < RING) | (rim.distance < LEAST_RING_PX)) & ((owned < 0) | (owned == which[:, None]))
-        # Used pixels first, then cut to the longest row: half of a window's box is never used.
+        # Put used pixels first and cut to the longest row: half of a window's box is unused.
         first = np.argsort(~used, axis=1, kind="stable")[:, : max(int(used.sum(1).max()), 1)]
         parts = (x, y, grey[v_in, u_in].astype(np.float64), used.astype(np.float64))
         return cls(*(np.take_along_axis(part, first, axis=1) for part in parts))
@@ -232,7 +232,7 @@ class _Windows:
     def fit(self, shape: Floats, dark: bool) -> tuple[Floats, Floats, Floats]:
         """Return the parameters (n, 10), the sigma of the centre (n,), px, and the misfit (n,)."""
         values = self._descend(self._first_guess(shape, dark), dark)
-        # Dirt and glare: pixels far beyond the window's own scatter get little weight.
+        # Dirt and glare: pixels with residuals far beyond the window's scatter get little weight.
         residual = self.grey - self._model(values, dark)[0]
         scatter = np.sqrt((self.weight * residual**2).sum(1) / np.maximum(self.weight.sum(1), 1))
         robust = self.weight / (1 + (residual / (3 * scatter[:, None] + 1e-9)) ** 2) ** 2
@@ -322,7 +322,7 @@ def _normal(jacobian: Floats, weight: Floats) -> tuple[Floats, Floats]:
 
 class _Rim:
     """Distances of pixels x, y (n, K), px, from the rim x^T A x = 1, A = [[a, b], [b, c]] (n,), negative inside.
-    They are to first order in q - 1, with q = sqrt(x^T A x), and exact for circles.
+    To first order in q - 1, with q = sqrt(x^T A x); exact for circles.
     """
 
     def __init__(self, x: Floats, y: Floats, a: Floats, b: Floats, c: Floats) -> None:

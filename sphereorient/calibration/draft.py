@@ -1,4 +1,4 @@
-"""The first calibration.yaml of a folder of plate pictures: dots counted, larger ones found, poses by their numbers."""
+"""Draft of a calibration.yaml from a folder of plate pictures: dots counted, fiducials found, poses by number."""
 
 import math
 import re
@@ -20,9 +20,9 @@ from sphereorient.files.yaml_file import DraftKey
 
 ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
 NUMBERED = re.compile(r"^(?P<camera>.*?)[-_ ]*(?P<pose>\d+)$")
-NORMALS = ([0, -1, 0], [0, 0, 1], [-1, 0, 0], [0, 1, 0])  # of walls, examples: cameras look through different ones
+NORMALS = ([0, -1, 0], [0, 0, 1], [-1, 0, 0], [0, 1, 0])  # of walls, examples: one wall per camera
 LARGER = 1.25  # of the usual width: a larger dot
-CERTAIN = 30  # dots in a lattice: those of the other polarity need not be sought
+CERTAIN = 30  # dots in a lattice from which the other polarity is not tried
 DIAMETERS = {"plate.dot_diameter": "width", "plate.fiducial_diameter": "larger"}  # keys, and parts of `PlateSeen`
 
 
@@ -31,16 +31,16 @@ class PlateSeen:
     """The plate of dots in one picture."""
 
     size: tuple[int, int]  # W, H px
-    columns: int = 0  # dots along x, or the longer side where x is not known; 0: no lattice of dots
+    columns: int = 0  # dots along x, or the longer side if x is unknown; 0: no lattice of dots
     rows: int = 0
     dark: bool = True
     width: float = math.nan  # of a usual dot, in pitches; NaN: none
     larger: float = math.nan  # of a larger dot; NaN: none
-    marks: tuple[int, int] | None = None  # dots from the origin's to the larger ones on x and y; None: not three
+    marks: tuple[int, int] | None = None  # dots from the origin to the larger dots on x and y; None: not three
 
 
 def numbered_pictures(folder: Path) -> dict[int, dict[str, str]]:
-    """Return pictures by pose, then camera: cam1_07.png, or 07.png of the only one; CameraError without such names."""
+    """Return pictures by pose and camera: cam1_07.png, or 07.png of a single one; CameraError without such names."""
     poses: dict[int, dict[str, str]] = defaultdict(dict)
     files = sorted(path for path in folder.glob("*") if path.suffix.lower() in ENDINGS)
     for path in files:
@@ -54,7 +54,7 @@ def numbered_pictures(folder: Path) -> dict[int, dict[str, str]]:
 
 
 def look_at_plate(path: Path) -> PlateSeen:
-    """Find the dots of a picture, dark or bright ones; CameraError where it cannot be decoded."""
+    """Find the dots of a picture, dark or bright; CameraError if it cannot be decoded."""
     picture = read_plate_picture(path)
     size = picture.shape[1], picture.shape[0]
     best, dark, most = None, True, LEAST_DOTS
@@ -74,8 +74,8 @@ def look_at_plate(path: Path) -> PlateSeen:
 
 
 def _marks(large: Ints) -> tuple[int | None, tuple[int, int] | None]:
-    """Return the axis of the lattice that is the plate's x, and the dots from the origin's to those on x and y.
-    The origin is the larger dot at which the other two make a right angle; from the front, y is left of x.
+    """Return the lattice axis that is the plate's x, and the dots between the origin and the larger dots on x and y.
+    The origin is the larger dot with the right angle between the other two; from the front, y is left of x.
     """
     if len(large) != 3:
         return None, None
@@ -91,9 +91,9 @@ def _marks(large: Ints) -> tuple[int | None, tuple[int, int] | None]:
 def calibration_keys(
     folder: Path, pictures: Mapping[int, Mapping[str, str]], where: str, progress: Progress
 ) -> tuple[list[DraftKey], dict[str, float]]:
-    """Return the keys of calibration.yaml, measured in the pictures of `folder`, and the widths of dots, in pitches,
-    by key. `where`: folder as the file names it. Raises CameraError (a picture that cannot be read, pictures of several
-    sizes, or no plate of dots in any).
+    """Return the keys of calibration.yaml, measured in the pictures of `folder`, and the widths of dots, in pitches, by
+    key. `where`: folder as the file names it. Raises CameraError (an unreadable picture, pictures of several sizes, or
+    no plate of dots in any).
     """
     paths = [folder / name for of_pose in pictures.values() for name in of_pose.values()]
     seen: list[PlateSeen] = []
@@ -104,7 +104,7 @@ def calibration_keys(
     sizes = Counter(one.size for one in seen)
     if len(sizes) > 1:
         got = ", ".join(f"{count} of {w} x {h}" for (w, h), count in sizes.most_common())
-        do = "calibrate cameras of different sizes one by one, or leave foreign pictures out"
+        do = "calibrate cameras of different sizes separately, or remove other pictures"
         raise camera_error(str(folder), "pictures of one size, px", got, do)
     with_dots = [one for one in seen if one.columns]
     cameras = sorted({name for of_pose in pictures.values() for name in of_pose})
@@ -114,13 +114,13 @@ def calibration_keys(
     wall = {"offset": 120.0, "thickness": 12.0, "n_glass": 1.49, "n_fluid": 1.36}
     walls = {name: {"normal": NORMALS[k % len(NORMALS)]} | wall for k, name in enumerate(cameras)}
     axes = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
-    behind = "of cameras behind a flat wall, each its own; normal points to the camera; leave it out in air"
+    behind = "flat wall in front of each camera; normal points to the camera; remove the key in air"
     keys = [
         _key("image_size", "W, H px, measured", list(seen[0].size)),
         _key("pixel_pitch", "mm, of the sensor, across and down", asked=[0.02, 0.02]),
         _key("model", "or pinhole, brown", "tsai"),
         *_plate_keys(with_dots, widths, len(seen)),
-        _key("surveyed.pose", "its plate defines the lab; any that was surveyed", min(pictures)),
+        _key("surveyed.pose", "any surveyed pose: its plate defines the lab", min(pictures)),
         _key("surveyed.R_lab_plate", "the plate's x, y, z axes in the lab, as columns", asked=axes),
         _key("surveyed.T_lab_plate", "its origin in the lab, mm", asked=[0, 0, 0]),
         *(
@@ -133,14 +133,14 @@ def calibration_keys(
 
 
 def _key(name: str, comment: str, value: Any = ..., asked: Any = None) -> DraftKey:
-    """Return a key with a value, or one that is asked for, with an example."""
+    """Return a key with a value, or a key to fill in, with an example."""
     return DraftKey(name=name, value=value, comment=comment, example=asked, asked=asked is not None)
 
 
 def _plate_keys(seen: Sequence[PlateSeen], widths: Mapping[str, float], count: int) -> list[DraftKey]:
-    """Return the keys of a plate of dots, where any picture shows one; no picture shows the pitch."""
+    """Return the keys of a plate of dots if any picture shows one; pictures do not show the pitch."""
     if not seen:
-        comment = f"no dots in any of {count} pictures: type, columns, rows, pitch (docs/calibration.md)"
+        comment = f"no dots found in {count} pictures: type, columns, rows, pitch (docs/calibration.md)"
         return [_key("plate", comment, asked={"type": "chessboard", "columns": 9, "rows": 6, "pitch": 10.0})]
     columns, rows = max(one.columns for one in seen), max(one.rows for one in seen)
     whole = sum((one.columns, one.rows) == (columns, rows) for one in seen)
@@ -164,7 +164,7 @@ def _plate_keys(seen: Sequence[PlateSeen], widths: Mapping[str, float], count: i
 
 
 def with_diameters(keys: Sequence[DraftKey], widths: Mapping[str, float]) -> list[DraftKey]:
-    """Return keys with the diameters of the dots in mm, from `widths` in pitches, once the pitch is known."""
+    """Return keys with the diameters of the dots in mm, from `widths` in pitches and the pitch."""
     pitch = next((key.value for key in keys if key.name == "plate.pitch"), None)
     known = {name: round(width * pitch, 4) for name, width in widths.items()} if isinstance(pitch, int | float) else {}
     return [replace(key, value=known.get(key.name, ...)) if key.value is ... else key for key in keys]

@@ -12,15 +12,15 @@ from sphereorient.calibration.dots import Dots
 from sphereorient.calibration.targets import FIDUCIALS, DotPlate, Floats, Ints, PlateView, refused_view
 from sphereorient.errors import refusal
 
-NEIGHBOURS = 24  # of each dot: at 75 degrees of tilt the next column is about the 12th nearest
-STEP_MISS = 0.28  # pitches by which a step may miss its dot
-MODEL_MISS = 0.06  # pitches by which a dot may miss the smooth map of the lattice
+NEIGHBOURS = 24  # of each dot: at a tilt of 75 degrees the next column is about the 12th nearest
+STEP_MISS = 0.28  # largest distance of a step's end from its dot, pitches
+MODEL_MISS = 0.06  # largest distance of a dot from the smooth map of the lattice, pitches
 CUBIC_FROM = 40  # dots from which the map has cubic terms, for lenses and walls
 SEEDS = 12  # starting dots tried
 LEAST_DOTS = 12  # fewer hardly test a homography (8 numbers)
 WIDTH_MISS = 0.25  # relative difference between a dot's width and that of calibration.yaml
 MIRROR = np.array([1, -1])
-NEAR = 0.5  # pitches within which a clicked place belongs to a dot
+NEAR = 0.5  # distance of a click from its dot, pitches
 CLICK = "click them with `sphereorient mark calibration.yaml`"
 AGAIN = "click the fiducials again with `sphereorient mark calibration.yaml`"
 STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
@@ -38,7 +38,7 @@ class Lattice:
 
 def find_lattice(dots: Dots) -> Lattice | None:
     """Find the largest square lattice among dots; None for fewer than 9 dots or a single row.
-    Measured in local radii, a dot's four neighbours are equally far and at right angles under any tilt.
+    Under any tilt, a dot's four neighbours are equally far, measured in local radii, and at right angles.
     """
     if len(dots) < 9:
         return None
@@ -88,7 +88,7 @@ class _Field:
         cosine = first @ self.metric[k] @ second / (self._pitches(k, first) * self._pitches(k, second))
         if abs(cosine) > 0.35:
             return None
-        # Seen from the front of the plate; v runs down, so the determinant of the steps is negative.
+        # From the front of the plate the determinant of the steps is negative, as v runs down.
         turned = first[0] * second[1] - first[1] * second[0]
         return (first, second) if turned < 0 else (first, -second)
 
@@ -122,7 +122,7 @@ class _Field:
     def _local_basis(
         self, k: int, at: tuple[int, int], dot_at: dict[tuple[int, int], int], guess: tuple[Floats, Floats]
     ) -> tuple[Floats, Floats]:
-        # Steps to neighbours already placed follow the perspective; otherwise the parent's step is used.
+        # Steps to neighbours with an index follow the perspective; otherwise use the parent's step.
         seen: tuple[list[Floats], list[Floats]] = ([], [])
         for di, dj in STEPS:
             m = dot_at.get((at[0] + di, at[1] + dj))
@@ -178,14 +178,14 @@ class _Map:
 
 
 def _checked(dots: Dots, which: Ints, index: Ints) -> Lattice | None:
-    """Drop dots that do not fit the smooth map, and add dots that steps did not reach."""
+    """Drop dots that do not fit the smooth map, and add dots that the steps did not reach."""
     which, index, lattice_map = _agreeing(dots, which, index)
     if lattice_map is None:
         return None
     rest = np.setdiff1d(np.arange(len(dots)), which)
     there = lattice_map.nearest(dots.uv_px[rest])
     taken = (there[:, None] == index).all(axis=2).any(axis=1)
-    # Fill gaps only: outside the reached area a stray blob is more likely than a dot.
+    # Only fill gaps: outside the indexed area a stray blob is likelier than a dot.
     inside = ((there >= index.min(axis=0)) & (there <= index.max(axis=0))).all(axis=1)
     fits = np.flatnonzero(inside & ~taken)
     fits = fits[lattice_map.misses(there[fits], dots.uv_px[rest[fits]]) < MODEL_MISS]
@@ -215,14 +215,14 @@ def _agreeing(dots: Dots, which: Ints, index: Ints) -> tuple[Ints, Ints, _Map | 
 def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture", clicked: Floats | None = None) -> PlateView:
     """Identify the dots of a picture on the plate by trying quarter turns and shifts; `name` appears in the reason.
     The larger dots must be exactly the visible fiducials. One placement: `tied`; several: `floating`; none: `refused`.
-    `clicked` (2 or 3, 2), px: about where the fiducials are, in the plate's order. They place the lattice instead of
-    the larger dots: `tied`, or `refused` where they contradict the plate. Dots of the wrong width are dropped.
+    `clicked` (2 or 3, 2), px: approximate fiducials, in the plate's order; they fix the lattice instead of the larger
+    dots: `tied`, or `refused` if they contradict the plate. Dots of the wrong width are dropped.
     """
     lattice = find_lattice(dots)
     if lattice is None or len(lattice.index) < LEAST_DOTS:
         got = f"{len(dots)} dots" + ("" if lattice is None else f", {len(lattice.index)} of them in a lattice")
         expected = f"a lattice of {LEAST_DOTS} dots or more, 3 x 3 of them whole"
-        do = "look at the picture: is the plate in it, sharp, and dark or bright as stated"
+        do = "check that the picture shows the plate, sharp, and with dark or bright dots as stated"
         return refused_view(name, expected, got, do)
     dot, fiducial = plate.dot_diameter_mm / plate.pitch_mm, plate.fiducial_diameter_mm / plate.pitch_mm
     large = lattice.width > np.sqrt(dot * fiducial)
@@ -252,22 +252,22 @@ def index_dots(dots: Dots, plate: DotPlate, name: str = "plate picture", clicked
         if len(_placements(index * MIRROR, large, plate)):
             return _mirrored(name)
         expected = f"larger dots at the grid indices {[list(f) for f in plate.fiducials]}"
-        got = f"{int(large.sum())} larger dots that fit there nowhere on {plate.columns} x {plate.rows}"
+        got = f"{int(large.sum())} larger dots that fit no part of {plate.columns} x {plate.rows}"
         return refused_view(name, expected, got, f"correct columns, rows and fiducials of the plate, or {CLICK}")
-    got = f"{int(large.sum())}, which leave {len(placements)} places of its dots on the plate"
-    do = f"show the fiducials, have the other camera see them at the same instant, or {CLICK}"
+    got = f"{int(large.sum())}, which allow {len(placements)} positions of the dots on the plate"
+    do = f"show the fiducials, to another camera at the same instant, or {CLICK}"
     view = targets.seen(plate, index, dots.uv_px[which], dots.sigma_px[which])
     return view.settled(plate, placements, refusal(name, expected="3 larger dots in view", got=got, do=do))
 
 
 def _clicked_placement(dots: Dots, lattice: Lattice, clicked: Floats, plate: DotPlate, name: str) -> Ints | PlateView:
-    """Return the placement (3,) of a lattice by which the clicked places are the fiducials; or the refusal."""
+    """Return the placement (3,) of a lattice that puts the fiducials at the clicked points; or the refusal."""
     at = np.zeros((len(clicked), 2), dtype=np.int64)
     for k, uv_px in enumerate(clicked):
         away = uv_px - dots.uv_px[lattice.which]
         near = int(np.argmin((away**2).sum(axis=1)))
         pitches = np.linalg.solve(lattice.steps[near], away[near])
-        step = np.rint(pitches)  # not zero: the place of a dot beside, which is covered
+        step = np.rint(pitches)  # not zero: the click is on a covered dot next to this one
         if np.abs(step).max() > 1 or np.hypot(*(pitches - step)) > NEAR:
             got = f"none at {uv_px.round(1).tolist()}"
             return refused_view(f"{name}, clicked {FIDUCIALS[k]}", "a dot of the lattice there", got, AGAIN)
@@ -284,7 +284,7 @@ def _clicked_placement(dots: Dots, lattice: Lattice, clicked: Floats, plate: Dot
 
 
 def _placements(index: Ints, large: NDArray[np.bool_], plate: DotPlate) -> Ints:
-    """Return the placements (m, 3) of a lattice on the plate that its larger dots allow."""
+    """Return the placements (m, 3) of a lattice on the plate that agree with its larger dots."""
     found = []
     for quarters in range(4):
         at = targets.quarter_turned(index, quarters)

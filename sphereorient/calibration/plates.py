@@ -27,10 +27,10 @@ from sphereorient.files.threads import Progress, counted, side_by_side
 from sphereorient.files.whole_file import read_whole
 
 LARGEST_BYTES, LARGEST_PIXELS = 300_000_000, 67_000_000  # of a picture of a plate
-WALL = 0.3  # of the way from the plates to the camera: where the search for a wall starts
-CLEARLY = 0.25  # of the distance of neighbouring points: a floating view is tied where one placement fits this well
-# Sigmas from which a parameter counts as undetermined, by the begin of its name: shares of focal length, distance and
-# picture's width; mm, rad and indices. The others, of the distortion, show in these.
+WALL = 0.3  # of the way from the plates to the camera: start of the search for a wall
+CLEARLY = 0.25  # of the distance of neighbouring points: misfit within which a floating view is tied
+# Sigma from which a parameter counts as undetermined, by the beginning of its name: shares of focal length, distance
+# and picture's width; mm, rad and indices. Undetermined distortion shows in these.
 LOOSE_SHARE = {"f": 0.01, "T_": 0.01, "centre": 0.02, "cx": 0.02, "cy": 0.02}
 LOOSE = {"rotation": 0.01, "port_offset": 5.0, "port_thickness": 5.0, "port_n_glass": 0.1, "port_n_fluid": 0.05}
 LOOSE |= {"port_tilt": 0.05}
@@ -86,7 +86,7 @@ def see_pictures(document: CalibrationDocument, progress: Progress) -> dict[Phot
 
 
 def read_plate_picture(path: Path, image_size: tuple[int, int] | None = None) -> NDArray[Any]:
-    """Return a picture's grey levels (H, W); CameraError if it is none, too large, or not of `image_size` (W, H)."""
+    """Return a picture's grey levels (H, W); CameraError if unreadable, too large, or not of `image_size` (W, H)."""
     content = read_whole(path, LARGEST_BYTES, "a picture", CameraError, "correct the path")
     pixels = claimed_pixels(content)
     # Do not decode a file that claims more pixels than any camera has.
@@ -202,7 +202,7 @@ def _collected(
 def _judged(
     document: CalibrationDocument, tied: Mapping[Photo, PlateView], result: Calibrated, progress: Progress
 ) -> Calibrated:
-    """Add what contradicts the calibration, with its most likely cause; CameraError where nothing can be trusted."""
+    """Add signs of a wrong calibration, with the likeliest cause; CameraError if it cannot be trusted."""
     found = doubts(result)
     lines = [f"{name}: {'; '.join(doubt.words)}" for name, doubt in found.items()]
     structured = [name for name, doubt in found.items() if doubt.structured]
@@ -212,14 +212,14 @@ def _judged(
         progress("cause", 1, 1)
     if any(doubt.hopeless for doubt in found.values()):
         *faults, do = lines
-        raise camera_error(str(document.path), "points that are missed by their noise only", "; ".join(faults), do)
+        raise camera_error(str(document.path), "residuals of noise alone", "; ".join(faults), do)
     return replace(result, verdict=tuple(lines))
 
 
 def _cause(
     document: CalibrationDocument, tied: Mapping[Photo, PlateView], result: Calibrated, structured: Sequence[str]
 ) -> str:
-    """Return advice: the change of lens or wall after which no residuals have structure, if there is one."""
+    """Return advice: the change of lens or wall that removes the structure of the residuals, if there is one."""
     ports = {name: _wall_before(result, name) for name in structured} | dict(document.ports)
     wall = {"fit_ports": ("port_offset", "port_n_fluid", *PORT_TILT)}
     trials: dict[Callable[[Any], str], CalibrationDocument] = {
@@ -233,7 +233,7 @@ def _cause(
             if not any(doubt.structured for doubt in doubts(again).values()):
                 causes.append((again.scale, f"{cause(again.cameras[name])} (rms {again.rms_px(name):.3f} px)"))
     if not causes:
-        return "check the plate (flat? pitch?), the focus of the pictures, and the walls under `ports`"
+        return "check that the plate is flat, its pitch, the focus of the pictures, and the walls under `ports`"
     words = ", or ".join(text for _, text in sorted(causes))
     return f"{name} (rms {result.rms_px(name):.3f} px) is explained by {words}"
 
@@ -244,7 +244,7 @@ def _wall_words(camera: PortCamera) -> str:
 
 
 def _wall_before(result: Calibrated, name: str) -> Port:
-    """Return a thin wall across a camera's axis between the camera and its plates, before water."""
+    """Return a thin wall across a camera's axis, between the camera and its plates, with water behind it."""
     camera = result.cameras[name]
     normal = -camera.R_cam_lab[2]
     middle = centre_lab_mm(camera)

@@ -1,4 +1,4 @@
-"""Check and repair cameras that moved after their calibration, with the tracked sphere; the results in words."""
+"""Check and repair of cameras that moved after their calibration, with the tracked sphere; reports of the results."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,22 +26,22 @@ OBSERVED = (str(Reason.OK), str(Reason.CONTRADICTS))
 PARTS = ("centre_px", "orientation")  # of a camera in a track
 MOVED = (*ROTATION, *TRANSLATION)
 PRIOR = torch.tensor([0.1] * 3 + [2.0] * 3, dtype=torch.float64)  # sigma of a camera's displacement, rad and mm
-BIAS_RAD = float(np.deg2rad(0.08))  # constant rotation error of one camera alone: a dark rim shifts its centre
-SHARED = 12  # consecutive frames that share one error of the centre: they have the same light
-HELD_SHARE = 0.5  # of the prior: a parameter with a larger sigma after the fit is not determined
-FRAMES_MIN = 20  # fewer do not separate displacements from the scatter of frames
+BIAS_RAD = float(np.deg2rad(0.08))  # constant rotation error of one camera alone, as a dark rim shifts its centre
+SHARED = 12  # consecutive frames with a common error of the centre, due to the same light
+HELD_SHARE = 0.5  # of the prior's sigma: a parameter with a larger sigma after the fit is not determined
+FRAMES_MIN = 20  # fewer do not separate a displacement from the scatter
 OUTLIER = 5.0  # robust standard deviations beyond which a frame is left out
-CONTRARY_SHARE = 0.5  # of the frames of both cameras; a passing reflection spoils a few, a moved camera nearly all
+CONTRARY_SHARE = 0.5  # of the frames of both cameras; a reflection affects a few, a moved camera nearly all
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Repaired:
-    """Cameras that fit together."""
+    """Repaired cameras, consistent with each other."""
 
     cameras: Mapping[str, Camera]
     moved: Mapping[str, Tensor]  # camera -> (6,) rotation (rad, camera frame) and T (mm), as in `with_parameters`
     sigma: Mapping[str, Tensor]  # camera -> (6,)
-    held: tuple[str, ...]  # parameters that the sphere does not determine; the prior keeps them near their old values
+    held: tuple[str, ...]  # parameters not determined by the sphere; the prior keeps them near their old values
     gap_before_mm: float  # rms distance between the lines of sight to the sphere's centre
     gap_after_mm: float
     frames: int
@@ -61,7 +61,7 @@ class CameraCheck:
 
 
 def observations_of(tracks: Iterable[Trajectory], cameras: Mapping[str, Camera]) -> Seen:
-    """Return what each camera alone measures of spheres, track after track; TrackError for an unknown camera."""
+    """Return the measurements of spheres by each camera alone, track after track; TrackError for an unknown camera."""
     parts = []
     for track in tracks:
         check_known(cameras, track.cameras, "track, camera", TrackError)
@@ -89,8 +89,8 @@ def check_cameras(cameras: Mapping[str, Camera], track: Trajectory) -> list[Came
 
 
 def refine_with_track(cameras_path: Path | str, track_path: Path | str) -> Repaired:
-    """Repair cameras (cameras.yaml) that moved after their calibration, with a track.h5 that was made with them, by all
-    spheres in it. CameraError for unreadable cameras or too few common frames; TrackError for a track of others.
+    """Repair cameras (cameras.yaml) that moved after their calibration, with all spheres of a track.h5 made with them.
+    CameraError for unreadable cameras or too few common frames; TrackError for a track of other cameras.
     """
     cameras, tracks = load_cameras(cameras_path), list(Tracks.load(track_path).values())
     used = {name: camera for name, camera in cameras.items() if name in tracks[0].cameras} or cameras
@@ -99,10 +99,10 @@ def refine_with_track(cameras_path: Path | str, track_path: Path | str) -> Repai
 
 def self_calibrate(seen: Seen) -> Repaired:
     """Rotate and shift two or more cameras until they see the sphere in one position and one orientation.
-    One camera stays, since a common motion is not observable: the first, of those that agree where these are more than
-    half of three or more. The others follow one by one, each against all before it. Orientations may differ by a small
-    constant rotation. A prior holds motions that change only the apparent size: distance and the common plane of the
-    lines of sight. CameraError for one camera, or too few frames that both saw.
+    One camera is fixed, since a common motion is not observable: the first one, or the first of a majority that agrees.
+    The others are fitted one by one, each to all before it. Orientations may differ by a small constant rotation. A
+    prior limits motions that change only the apparent size: distance, and motion in the common plane of the lines of
+    sight. CameraError for one camera, or too few common frames.
     """
     names = list(seen.cameras)
     if len(names) < 2:
@@ -118,7 +118,7 @@ def self_calibrate(seen: Seen) -> Repaired:
         pair = _Pair(replace(seen, cameras=repaired, R_lab_body=R_lab_body), [first, *others[:place]], k)
         moved[name], sigma[name] = change, spread = pair.solved()
         repaired[name] = with_parameters(camera, MOVED, change)
-        # The same picture, as read with the repaired camera.
+        # The picture, interpreted with the repaired camera.
         R_view_body = R_lab_view(camera, seen.centre_px[:, k]).mT @ R_lab_body[:, k]
         R_lab_body[:, k] = R_lab_view(repaired[name], seen.centre_px[:, k]) @ R_view_body
         held += [f"{name}.{part}" for part, loose in zip(MOVED, spread > HELD_SHARE * PRIOR, strict=True) if loose]
@@ -173,7 +173,7 @@ class _Pair:
     def solved(self) -> tuple[Tensor, Tensor]:
         """Return the motion (6,) and its sigmas from the scatter of frames at the solution."""
         at = torch.zeros(9, dtype=torch.float64)
-        for _ in range(4):  # scatter and inliers anew
+        for _ in range(4):  # update scatter and inliers
             known = dict(zip(("spread", "kept"), self._scatter(at[:6]), strict=True))
             at = least_squares(partial(self._residuals, **known), partial(self._slopes, **known), at)
         slopes = self._slopes(at, *self._scatter(at[:6]))
@@ -184,7 +184,7 @@ class _Pair:
         found = torch.cat([self.gaps(change)[:, None], self.rotations(change)], dim=-1)
         away = found - found.median(dim=0).values
         spread = (1.4826 * away.abs().median(dim=0).values).clamp_min(1e-6)
-        # Reject frames: a soft loss would soften the prior too, and mirrored orientations would still pull.
+        # Reject frames: a soft loss would weaken the prior too, and mirrored orientations would still count.
         return spread, (away.abs() <= OUTLIER * spread).all(-1)
 
     def _residuals(self, at: Tensor, spread: Tensor, kept: Tensor) -> Tensor:
@@ -198,7 +198,7 @@ class _Pair:
 
 
 def _with_spread(camera: Camera, known: ParameterCovariance, spread: Tensor) -> Camera:
-    """Replace the variances of the pose; its correlations with the lens are lost."""
+    """Replace the variances of the pose; its correlations with the lens are set to 0."""
     matrix = known.matrix.clone()
     for part, sigma in zip(MOVED, spread.tolist(), strict=True):
         if part in known.names:
@@ -220,7 +220,7 @@ def repair_lines(result: Repaired) -> list[str]:
 
 
 def check_lines(checks: Sequence[CameraCheck]) -> list[str]:
-    """Return how well each pair of cameras fits together."""
+    """Return how well each pair of cameras agrees."""
     each = ((check, *check.percentile(50), *check.percentile(95)) for check in checks)
     return [
         f"{' and '.join(check.names)}: lines of sight miss each other by {gap:.4f} mm (median), {gap95:.4f} mm (95 %); "
@@ -230,7 +230,7 @@ def check_lines(checks: Sequence[CameraCheck]) -> list[str]:
 
 
 def contradiction_lines(track: Trajectory) -> list[str]:
-    """Return advice where the cameras disagree on the sphere's position for most of a movie; else an empty list."""
+    """Return advice if the cameras disagree on the sphere's position in most of a movie; else an empty list."""
     reasons = [camera.reason for camera in track.cameras.values()]
     seen = sum(all(why in OBSERVED for why in frame) for frame in zip(*reasons, strict=True))
     contrary = sum(Reason.CONTRADICTS in frame for frame in zip(*reasons, strict=True))

@@ -11,15 +11,15 @@ from sphereorient.cameras.parameters import AnyCamera, with_parameters
 from sphereorient.errors import CameraError, ShapeError, refusal
 
 DAMPING = 1e-4  # at the start, relative to the information's diagonal
-LEAST, MOST = 1e-12, 1e10  # of the damping; beyond the upper one no step helps
+LEAST, MOST = 1e-12, 1e10  # of the damping; above the upper limit no step helps
 FAR = 1e6  # residual of a point that a trial camera does not see
-SIGMA_PX = 0.05  # of good centroids, and of corners of drawn boards (0.03 to 0.07): none is certain
+SIGMA_PX = 0.05  # least error of points: good centroids, corners of drawn boards (0.03 to 0.07)
 UNDETERMINED = 1e-9  # smallest eigenvalue of the scaled information: less is zero in float64
 
 
 def slopes_along(function: Callable[[Tensor], Tensor], at: Tensor, directions: Sequence[Tensor] | Tensor) -> Tensor:
-    """Return derivatives along K directions (shape of `at`) of a function, (..., K) where the function returns (...).
-    Source: double vjp (Townsend 2017); it calls the function once, forward differentiation K times (ten times slower).
+    """Return derivatives along K directions (shape of `at`) of a function, (..., K) for a function that returns (...).
+    Source: double vjp (Townsend 2017); one call of the function. Forward differentiation takes K and ten times as long.
     """
     with torch.enable_grad():
         point = at.detach().requires_grad_()
@@ -43,10 +43,10 @@ def least_squares(
     gain: float = 1e-14,
     steps: int = 100,
 ) -> Tensor:
-    """Return the unknowns (K,) that minimise the sum of squared `residuals` (n,), or of soft L1 losses, which grow
-    linearly beyond `soft`. NaN counts as FAR; a step whose residuals raise CameraError is rejected. `slopes`: (n, K).
-    Ends after `steps`, or where the cost decreases by the share `gain` only. scipy's least_squares needs three times as
-    many slopes of a whole calibration.
+    """Return the unknowns (K,) that minimise the sum of squared `residuals` (n,), or of soft L1 losses, linear beyond
+    `soft`. NaN counts as FAR; a step whose residuals raise CameraError is rejected. `slopes`: (n, K). Ends after
+    `steps`, or if the cost decreases by less than the share `gain`. scipy's least_squares needs three times as many
+    slopes for a whole calibration.
     Source: Marquardt 1963; weights of the soft L1 loss, Triggs et al. 2000 (appendix).
     """
 
@@ -89,7 +89,7 @@ def inverse_information(information: Tensor, names: Sequence[str] = ()) -> Tenso
     if names and float(values[0]) < UNDETERMINED:
         part = vectors[:, 0].abs()
         loose = [name for name, share in zip(names, part.tolist(), strict=True) if share > 0.3 * float(part.max())]
-        do = "add points at other depths, tilt the plate, or hold some of these parameters"
+        do = "add points at other depths, tilt the plate, or fix some of these parameters"
         raise camera_error("points", "a determined camera", f"no information on {', '.join(loose)}", do)
     whole: Tensor = scale[:, None] * ((vectors / values.clamp_min(1e-14)) @ vectors.mT) * scale
     return (whole + whole.mT) / 2
@@ -103,7 +103,7 @@ def fit_to_points(camera: AnyCamera, names: Sequence[str], x_lab_mm: Tensor, uv_
     x_lab_mm, uv_px = checked_points(x_lab_mm, uv_px)
     size, least = len(names), -(-len(names) // 2)
     if len(x_lab_mm) < least:
-        expected, do = f"{least} or more for {size} parameters", "add points, or hold some parameters"
+        expected, do = f"{least} or more for {size} parameters", "add points, or fix some parameters"
         raise camera_error("points", expected, f"{len(x_lab_mm)}", do)
     start = cast(AnyCamera, replace(cast(Any, camera), covariance=None))
 
@@ -140,7 +140,7 @@ def checked_points(x_lab_mm: Tensor, uv_px: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def rms_px(camera: Camera, x_lab_mm: Tensor, uv_px: Tensor) -> float:
-    """Return the rms distance, px, between the images of points and their pixels; NaN where a point has no image."""
+    """Return the rms distance, px, of the images of points from their pixels; NaN if a point has no image."""
     return float((camera.project(x_lab_mm).detach() - uv_px).square().sum(-1).mean().sqrt())
 
 

@@ -14,15 +14,15 @@ from sphereorient.trajectory import Trajectory
 
 CAP_RINGS = (0.35, 0.75)  # of the radius: points of the visible cap
 PER_RING = 6  # points of each of these
-DIRECT_FRAMES = 200  # positions computed directly; a quadratic in position interpolates the smooth effect
+DIRECT_FRAMES = 200  # positions computed directly; a quadratic in position interpolates between them
 
 
 def systematic_errors(
     cameras: Mapping[str, Camera], covariance: ParameterCovariance, position_lab_mm: Tensor, radius_mm: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the covariances (N, 3, 3) of the errors that all frames share, by the cameras' covariance: of the position
-    (N, 3), lab, mm^2, NaN where that is, and of delta in R_true = exp([delta]x) R, lab, rad^2.
-    Parameters are named camera.parameter. A small camera error acts on cap and limb like a small change of pose.
+    """Return the covariances (N, 3, 3) of errors common to all frames, due to the cameras' covariance: of the position
+    (N, 3), lab, mm^2, NaN for NaN positions, and of delta in R_true = exp([delta]x) R, lab, rad^2. Parameters are named
+    camera.parameter. A small camera error has the effect of a small change of pose on cap and limb.
     Source: first-order propagation of errors; least squares of the pose with fixed design.
     """
     known = torch.isfinite(position_lab_mm).all(-1)
@@ -56,7 +56,7 @@ def _pose_by_parameters(
         own = [k for k, label in enumerate(names) if label.partition(".")[0] == name]
         by_pose, by_parameter = _slopes(camera, [names[k].partition(".")[2] for k in own], positions, radius_mm)
         information += by_pose.mT @ by_pose
-        # The picture is given: the pose must cancel the effect of the parameters.
+        # The picture is fixed: the pose cancels the effect of the parameters.
         pull[:, :, own] -= by_pose.mT @ by_parameter
     scale = information.diagonal(dim1=-2, dim2=-1).rsqrt()
     scaled = scale[..., None] * information * scale[..., None, :]
@@ -94,7 +94,7 @@ def _slopes(camera: Camera, names: list[str], positions: Tensor, radius_mm: floa
 
 
 def _grazed(camera: Camera, positions: Tensor, arms: Tensor, radius_mm: float) -> Tensor:
-    """Return arms (N, M, 3), lab, mm, to the tangent points of lines of sight; only these move with the limb."""
+    """Return arms (N, M, 3), lab, mm, to the tangent points of lines of sight, which move with the limb."""
     outward = normalize(arms, dim=-1)
     for _ in range(4):  # each reduces the error by the factor radius over distance
         along = camera.rays(camera.project(positions[:, None] + arms)).direction_lab
@@ -112,7 +112,7 @@ def _ring(share: float, count: int, turned: float = 0.0) -> Tensor:
 def with_systematic_errors(
     track: Trajectory, cameras: Mapping[str, Camera], covariance: ParameterCovariance | None, radius_mm: float
 ) -> Trajectory:
-    """Add the calibration's systematic errors to the poses; unchanged without a covariance of the camera parameters."""
+    """Add the calibration's systematic errors to the poses; no change without a covariance of the camera parameters."""
     if covariance is None:
         return track
     position = torch.from_numpy(track.position)
@@ -127,11 +127,11 @@ def with_systematic_errors(
 
 
 def with_lasting_errors(track: Trajectory, covariance: Tensor, alone: Tensor) -> Trajectory:
-    """Add the errors that all frames share, which no path averages away, to the covariances of the poses.
+    """Add the errors common to all frames, which no path averages away, to the covariances of the poses.
     Covariances of delta (rad, lab) and position (mm): (6, 6) by all cameras together, (C, 6, 6) by each alone.
     """
     use = torch.from_numpy(track.believed)
-    # Those of each camera are its own: the fewer count, the less of them is averaged away.
+    # Errors of the cameras are independent: fewer cameras in use average them less.
     together = (use.shape[1] / use.sum(1).clamp_min(min(2, use.shape[1])))[:, None, None] * covariance
     single = (use.to(torch.float64) @ alone.flatten(1)).reshape(-1, 6, 6)
     whole = torch.where((use.sum(1) == 1)[:, None, None], single, together).numpy()

@@ -14,7 +14,7 @@ from sphereorient.files.yaml_file import short
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-MOST = 1000  # columns or rows: arrays of all points are made, and no camera resolves more
+MOST = 1000  # columns or rows; no camera resolves more
 LONGEST_MM = 1e5  # of any length of a plate: 100 m
 FIDUCIALS = ("origin", "+x", "+y")  # their names, in the order of `DotPlate.fiducials`
 
@@ -129,7 +129,7 @@ class CharucoBoard(CalibrationTarget):
 
     marker_mm: float  # side of a marker
     dictionary: str = "DICT_4X4_50"  # OpenCV's name
-    legacy_pattern: bool = False  # as OpenCV before 4.6 draws it
+    legacy_pattern: bool = False  # pattern of OpenCV before 4.6
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -166,7 +166,7 @@ class CircleGrid(CalibrationTarget):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.asymmetric and self.rows % 2 == 0:  # the same upside down, and OpenCV does not find it
+        if self.asymmetric and self.rows % 2 == 0:  # symmetric upside down, and not found by OpenCV
             raise camera_error("plate, rows", "an odd number", f"{self.rows}", "count the rows, or cover one of them")
         nearest = self.pitch_mm * (np.sqrt(2) if self.asymmetric else 1)
         if self.dot_diameter_mm >= nearest:
@@ -198,7 +198,7 @@ def _kind_of(entry: Any) -> _Kind | None:
 
 
 def missing_keys(entry: Any) -> list[str]:
-    """Return the keys that the parsed `plate` of calibration.yaml needs and has not; none for an unknown type."""
+    """Return the keys missing in the parsed `plate` of calibration.yaml; none for an unknown type."""
     keys = target_keys(kind) if (kind := _kind_of(entry)) else {}
     return [key for key, (_, needed) in keys.items() if needed and key not in entry]
 
@@ -230,8 +230,8 @@ def plate_from_entry(entry: Any, name: str = "calibration.yaml, plate") -> Calib
 @dataclass(frozen=True, eq=False)
 class PlateView:
     """Points of the plate and their pixels in one picture.
-    `tied`: every point is identified. `floating`: each row of `placements` is a possible place on the plate;
-    `points_plate_mm` are those before any. `refused`: unusable, all arrays are empty.
+    `tied`: every point is identified. `floating`: each row of `placements` is a possible placement on the plate;
+    `points_plate_mm` are without placement. `refused`: unusable, all arrays are empty.
     """
 
     points_plate_mm: Floats  # (n, 3), plate frame
@@ -247,7 +247,7 @@ class PlateView:
         return len(self.index)
 
     def settled(self, plate: CalibrationTarget, placements: Ints, reason: str) -> "PlateView":
-        """Return the view as `tied` by the only one of its placements (m, 3), or `floating` for this reason."""
+        """Return the view as `tied` if there is one placement (m, 3), or `floating` for this reason."""
         if len(placements) == 1:
             return placed(self, plate, placements[0])
         return replace(self, state="floating", reason=reason, placements=placements)

@@ -1,4 +1,4 @@
-"""Calibration of one camera of Tsai's model, and the first guess of all cameras, from which `bundle` goes on."""
+"""Calibration of one camera of Tsai's model, and the first guess of all cameras, the start of `bundle`."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -28,12 +28,12 @@ LINE = 1e-6  # width over length below which points are on a line
 POINTS_OF_PLANE, POINTS_OF_SPACE = 5, 7  # Tsai's least numbers
 FOCAL, TRIED = (1.0, 60.0), 15  # focal lengths tried, over the largest distance of a pixel from the picture's middle
 UNCERTAIN_F = 0.1  # sigma of f over f beyond which f and T_z cannot be separated
-MISFIT = 0.01  # rms over the picture's diagonal: no lens with one fitted kappa misses by so much
+MISFIT = 0.01  # rms over the picture's diagonal; larger than of any lens with one kappa
 ADD = "add points"
 Pose = tuple[Tensor, Tensor]  # R (3, 3) and T (3,), mm
 FREE = ("f", "kappa1", *ROTATION, *TRANSLATION)
-POINTS_MIN = 6  # of a picture that is used
-VIEWS_MIN = 3  # of a camera: two planes do not determine the focal length
+POINTS_MIN = 6  # least points of a usable picture
+VIEWS_MIN = 3  # least pictures of a camera: two planes do not determine the focal length
 SAME = ("image_size", "R_cam_lab", "T_cam_lab_mm", "centre_px")  # fields of all models
 
 
@@ -41,10 +41,10 @@ def calibrate_tsai(
     x_lab_mm: Tensor, uv_px: Tensor, image_size: tuple[int, int], pixel_pitch_mm: tuple[float, float]
 ) -> TsaiCamera:
     """Calibrate a camera from points (n, 3), lab, mm, and their pixels (n, 2), by least squares of f, kappa1, R and T.
-    The picture has `image_size` (W, H), px, the sensor a pixel pitch along u and v, mm; s_x is 1, the centre the
-    picture's middle: `fit_to_points` fits these too. Points in one plane also fit mirrored: give the seen side.
-    Raises CameraError (points too few, collinear, parallel to the sensor, mirrored, not finite, or of other pixels),
-    ShapeError (arrays of another shape).
+    The picture has `image_size` (W, H), px, the sensor a pixel pitch along u and v, mm. s_x is 1 and the centre the
+    picture's middle; `fit_to_points` fits these too. Points in one plane also fit as seen from behind: give the seen
+    side. Raises CameraError (points too few, collinear, parallel to the sensor, mirrored, not finite, or of other
+    pixels), ShapeError (arrays of another shape).
     Source: Tsai 1987 (model); Terzakis and Lourakis 2020 (SQPnP, the start for each of some focal lengths).
     """
     points, pixels = checked_points(x_lab_mm, uv_px)
@@ -82,12 +82,12 @@ def _is_flat(points: Tensor) -> bool:
 
 
 def _starts(points: Tensor, sensor_mm: Tensor) -> list[tuple[float, Tensor, Tensor]]:
-    """Return f, R and T of the poses that fit best: the best one, and the best of those turned far from it."""
+    """Return f, R and T of the best poses: the best one, and the best of those rotated far from it."""
     middle, found = points.mean(0), []
     for f_mm in np.geomspace(*FOCAL, TRIED) * float(sensor_mm.abs().max()):
         K = np.diag([f_mm, f_mm, 1.0])
         arrays = (points - middle).numpy(), sensor_mm.numpy(), K, None
-        with suppress(cv2.error):  # pixels that are too near to each other
+        with suppress(cv2.error):  # pixels too near to each other
             _, turns, moves, misses = cv2.solvePnPGeneric(*arrays, flags=cv2.SOLVEPNP_SQPNP)
             for turn, move, miss in zip(turns, moves, misses[:, 0], strict=True):
                 R = so3.exp(torch.from_numpy(turn[:, 0]))
@@ -116,7 +116,7 @@ def _parallel(got: str) -> CameraError:
 
 def guess_rig(document: CalibrationDocument, views: Mapping[str, Mapping[int, PlateView]]) -> Rig:
     """Return cameras without distortion and plate poses from the tied views of each camera, keyed by row of the pose.
-    T is NaN for a pose without enough points; CameraError for too few pictures or a camera that shares no pose.
+    T is NaN for a pose without enough points; CameraError for too few pictures, or a camera that shares no pose.
     Source: Zhang 2000 (OpenCV's calibrateCamera).
     """
     lenses = {name: _zhang(name, seen, document) for name, seen in views.items()}
@@ -140,7 +140,7 @@ def guess_from_points(document: CalibrationDocument, name: str, x_lab_mm: Tensor
 
 def _camera(document: CalibrationDocument, name: str, start: PinholeCamera) -> Camera:
     """Return a camera of the document's model, behind its port if it has one, from a pinhole camera in the liquid.
-    Distortion begins with the defaults of the model.
+    Distortion starts at the defaults of the model.
     """
     port, (pitch_u, pitch_v), kind = document.ports.get(name), document.keys.pixel_pitch, MODELS[document.keys.model]
     start = start if port is None else _in_air(start, port)
@@ -169,7 +169,7 @@ def _zhang(
     (width, height), (pitch_u, pitch_v) = document.keys.image_size, document.keys.pixel_pitch
     guess = np.array([[pitch_v / pitch_u * 3000.0, 0, width / 2], [0, 3000.0, height / 2], [0, 0, 1]])
     flags = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
-    flags |= cv2.CALIB_FIX_PRINCIPAL_POINT  # hardly improves the guess, and spoils it with a weak set of poses
+    flags |= cv2.CALIB_FIX_PRINCIPAL_POINT  # a free one hardly improves the guess, and spoils it for weak sets of poses
     none: Any = None
     _, K, _, turns, moves = cv2.calibrateCamera(points, pixels, document.keys.image_size, guess, none, flags=flags)
     turn, move = (torch.from_numpy(np.stack(parts)[..., 0]) for parts in (turns, moves))
@@ -181,7 +181,7 @@ def _zhang(
 def _chained(
     relative: Mapping[str, Mapping[int, Pose]], surveyed: Mapping[int, Pose]
 ) -> tuple[dict[str, Pose], dict[int, Pose]]:
-    """Propagate the lab frame from the surveyed poses to cameras, from those to other poses, and so on."""
+    """Propagate the lab frame from the surveyed poses to cameras, from these to other poses, and so on."""
     plate, placed = dict(surveyed), dict[str, Pose]()
     grown = True
     while grown:
@@ -206,7 +206,7 @@ def _chained(
 
 
 def _in_air(start: PinholeCamera, port: Port) -> PinholeCamera:
-    """Return the camera in air for one in the liquid: small-angle Snell, angles times n, distance to the wall / n."""
+    """Return the camera in air for one in the liquid, by Snell's law for small angles."""
     R, centre, normal, n = start.R_cam_lab, start.centre_lab_mm, port.normal_lab, float(port.n_fluid)
     height = float(centre @ normal) - float(port.offset_mm)
     true_height = height / n + float(port.thickness_mm) * (1 - 1 / float(port.n_glass))

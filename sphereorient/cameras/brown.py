@@ -11,8 +11,8 @@ from torch import Tensor
 from sphereorient.cameras.checks import camera_error, check_points, check_positive
 from sphereorient.cameras.model import CentralCamera, Key, middle_of_picture
 
-FOLD = -4.0 / 27.0  # below this value of kappa1 r_u^2 the cubic has no root on the branch that holds the picture
-RIM_STEPS = 33  # points per side of the picture where the distortion is tried; both corners are among them
+FOLD = -4.0 / 27.0  # least kappa1 r_u^2 with a root of the cubic on the picture's branch
+RIM_STEPS = 33  # tested points per side of the picture, with both corners
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,7 +34,7 @@ class TsaiCamera(CentralCamera):
     )
 
     def __post_init__(self) -> None:
-        """Refuse also a distortion that folds inside the picture."""
+        """Check the fields, and refuse a distortion that folds inside the picture."""
         super().__post_init__()
         width, height = self.image_size
         corners = self.centre_px.new_tensor([(u, v) for u in (-0.5, width - 0.5) for v in (-0.5, height - 0.5)])
@@ -96,27 +96,27 @@ def shrinkage(bend: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PolynomialCamera(CentralCamera):
-    """A lens with Brown's polynomial on a plane that the model defines."""
+    """A lens with Brown's polynomial on a plane defined by the model."""
 
     k: Tensor  # (n,), radial k1, k2, ...
 
     def __post_init__(self) -> None:
-        """Refuse also a distortion that folds inside the picture; its rim is enough."""
+        """Check the fields, and refuse a distortion that folds inside the picture, from its rim."""
         super().__post_init__()
         u, v = (torch.linspace(-0.5, side - 0.5, RIM_STEPS, dtype=torch.float64) for side in self.image_size)
         rim_px = torch.cat([torch.cartesian_prod(u, v[[0, -1]]), torch.cartesian_prod(u[[0, -1]], v)])
         lost = torch.isnan(self.undistort(rim_px).detach()).any(-1)
         if bool(lost.any()):
             got, do = "one that folds before ({:g}, {:g})".format(*rim_px[lost][0]), "correct it or calibrate again"
-            raise camera_error("k, p", "a distortion that can be undone in the picture", got, do)
+            raise camera_error("k, p", "a distortion that is invertible in the picture", got, do)
 
     @property
     def _p_opencv(self) -> Tensor:
-        """(2,), tangential, in OpenCV's order; this default has none."""
+        """(2,), tangential coefficients in OpenCV's order; default: zeros."""
         return torch.zeros(2, dtype=torch.float64)
 
     def _plane(self, uv_px: Tensor, distorted: bool) -> Tensor:
-        """Return pixels as points on the plane of the polynomial."""
+        """Return the points of pixels on the plane of the polynomial."""
         return (uv_px - self.centre_px.to(uv_px)) / self.focal_px.to(uv_px)
 
     def _pixel(self, xy: Tensor, distorted: bool) -> Tensor:
@@ -228,20 +228,20 @@ def bent(xy: Tensor, k: Tensor, p: Tensor) -> Tensor:
 
 
 def straightened(xy_bent: Tensor, k: Tensor, p: Tensor) -> Tensor:
-    """Invert `bent`: return the points (..., 2) that it takes to `xy_bent`; NaN, with gradient 0, without solution."""
+    """Invert `bent`: return the points (..., 2) with the image `xy_bent`; NaN, with gradient 0, without solution."""
     goal, kk, pp = xy_bent, k.to(xy_bent), p.to(xy_bent)
     with torch.no_grad():
         radius = goal.norm(dim=-1, keepdim=True)
         safe = torch.where(radius > 0, radius, torch.ones_like(radius))
         xy = goal * (_radius_before(radius, kk, math.sqrt(fold2(k))) / safe)
-        for _ in range(8):  # of Newton, from the radial solution: what is left is as small as the tangential part
+        for _ in range(8):  # Newton steps from the radial solution, whose error is as small as the tangential part
             xy = _newton(xy, goal, kk, pp)
         missed = (_bent(xy, kk, pp)[0] - goal).norm(dim=-1, keepdim=True)
-        close = missed <= 1e4 * torch.finfo(goal.dtype).eps * radius  # rounding, times what a near fold magnifies
+        close = missed <= 1e4 * torch.finfo(goal.dtype).eps * radius  # rounding, magnified near a fold
         exists = close & _before_fold(xy, k, p)
         xy = torch.where(exists, xy, torch.zeros_like(xy))
     goal = torch.where(exists, goal, torch.zeros_like(goal))
-    # Two more steps carry the implicit derivative: one makes the first right, two also the second.
+    # Two more steps carry the implicit derivatives: one the first, two also the second.
     xy = _newton(_newton(xy, goal, kk, pp), goal, kk, pp)
     return torch.where(exists, xy, torch.full_like(xy, torch.nan))
 
@@ -299,11 +299,11 @@ def _radius_before(goal: Tensor, k: Tensor, fold: float) -> Tensor:
         return r * (1 + r2 * _series(r2, k)) - goal, 1 + r2 * _series(r2, by_r)
 
     low, high = torch.zeros_like(goal), goal.clamp_max(fold)
-    for _ in range(10):  # until the root lies in the upper half of the bracket, or 1000 times away from the goal
+    for _ in range(10):  # until the root is in the upper half of the bracket, or 1000 times away from the goal
         half_is_beyond, is_below = value_and_slope(high / 2)[0] > 0, value_and_slope(high)[0] < 0
         high = torch.where(is_below, 2 * high, torch.where(half_is_beyond, high / 2, high)).clamp_max(fold)
     r = high
-    for _ in range(30):  # of Newton held in a bracket; at a fold, where Newton stalls, halving alone leaves 1e-9
+    for _ in range(30):  # bracketed Newton steps; at a fold, where Newton stalls, bisection alone reaches 1e-9
         value, slope = value_and_slope(r)
         low, high = torch.where(value < 0, r, low), torch.where(value < 0, high, r)
         better = r - value / slope

@@ -1,4 +1,4 @@
-"""What every camera gives: rays, projection and the covariance of its parameters; and the geometry of rays."""
+"""The interface of all cameras (rays, projection, covariance of parameters), and the geometry of rays."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -10,13 +10,13 @@ from torch import Tensor
 
 from sphereorient.cameras.checks import camera_error, check_points
 
-PARALLEL = 1e-6  # sine of the angle of two lines of sight a unit apart that are parallel
-ASYMMETRY = 1e-6  # of the correlation matrix: covariances written with seven digits pass
+PARALLEL = 1e-6  # sine of the angle below which neighbouring lines of sight are parallel
+ASYMMETRY = 1e-6  # of the correlation matrix; allows covariances written with seven digits
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rays:
-    """Half lines in the lab along which pixels see."""
+    """Lines of sight of pixels, as half lines in the lab."""
 
     origin_lab_mm: Tensor  # (..., 3), a point of the ray: the projection centre, or the refracting wall's liquid side
     direction_lab: Tensor  # (..., 3), unit length, away from the camera
@@ -43,7 +43,7 @@ class ParameterCovariance:
         if not bool(torch.isfinite(matrix).all()) or bool((matrix.diagonal() < 0).any()):
             raise camera_error("covariance, matrix", "finite numbers, none below zero on the diagonal", "others", do)
         sigma = matrix.diagonal().sqrt()
-        scale = torch.where(sigma > 0, sigma, torch.ones_like(sigma))  # parameters of different units: correlations
+        scale = torch.where(sigma > 0, sigma, torch.ones_like(sigma))  # units differ: check correlations
         correlation = matrix / (scale[:, None] * scale)
         asymmetry = float((correlation - correlation.mT).abs().max())
         if asymmetry > ASYMMETRY:
@@ -60,7 +60,7 @@ class ParameterCovariance:
         return dict(zip(self.names, self.matrix.diagonal().sqrt().tolist(), strict=True))
 
     def of(self, cameras: Iterable[str]) -> "ParameterCovariance | None":
-        """Return the block of some cameras, for names like cam1.f; None without parameters of them."""
+        """Return the block of some of the cameras, for names like cam1.f; None without parameters of them."""
         wanted = set(cameras)
         kept = [k for k, name in enumerate(self.names) if name.partition(".")[0] in wanted]
         if not kept:
@@ -97,22 +97,22 @@ class Camera(Protocol):
         """Return the rays of pixels (..., 2); behind a wall they start on its liquid side."""
 
     def across_lab(self, x_lab_mm: Tensor) -> Tensor:
-        """Return the unit direction, (3,) or (..., 3), along which a sphere at points (..., 3) shows its radius."""
+        """Return the unit direction, (3,) or (..., 3), in which the radius of a sphere at points (..., 3) appears."""
 
     def undistort(self, uv_px: Tensor) -> Tensor:
-        """Return the pixels (..., 2) at which the same camera without distortion images what `uv_px` images."""
+        """Return pixels (..., 2) without distortion: those of the same object in the same camera without distortion."""
 
     def distort(self, uv_px: Tensor) -> Tensor:
-        """Return the pixels (..., 2) that `undistort` takes to `uv_px`."""
+        """Return the pixels (..., 2) whose undistorted ones are `uv_px`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CoarserCamera:
-    """A camera whose pixels are the means of `factor` times `factor` of another one's."""
+    """A camera whose pixels are means of `factor` times `factor` pixels of another camera."""
 
     camera: Camera
     factor: int
-    image_size: tuple[int, int] = field(init=False)  # what is left at the right and below is no pixel
+    image_size: tuple[int, int] = field(init=False)  # incomplete pixels at the right and below are left out
     R_cam_lab: Tensor = field(init=False)
     T_cam_lab_mm: Tensor = field(init=False)
     covariance: ParameterCovariance | None = field(init=False)  # its parameters are in the pixels of `camera`
@@ -138,7 +138,7 @@ class CoarserCamera:
         return self.camera.rays(self._fine(uv_px))
 
     def across_lab(self, x_lab_mm: Tensor) -> Tensor:
-        """As of the camera."""
+        """Return the direction of the original camera."""
         return self.camera.across_lab(x_lab_mm)
 
     def undistort(self, uv_px: Tensor) -> Tensor:
@@ -171,9 +171,9 @@ def triangulate(rays_a: Rays, rays_b: Rays) -> tuple[Tensor, Tensor]:
 
 
 def nearest_point(rays: Sequence[Rays]) -> tuple[Tensor, Tensor]:
-    """Return the point (..., 3), lab, mm, of the least sum of squared distances from two or more rays, and the largest
-    distance (...), mm, between any two of them; of two rays, those of `triangulate`. All have one leading shape; rays
-    that are NaN take no part. Both are NaN, with gradient 0, where all others are parallel, or fewer than two.
+    """Return the point (..., 3), lab, mm, with the least sum of squared distances from two or more rays, and the
+    largest distance (...), mm, between any two of them; for two rays, as `triangulate`. All have one leading shape; NaN
+    rays are left out. Both results are NaN, with gradient 0, for parallel rays or fewer than two.
     """
     if len(rays) == 2:
         return triangulate(*rays)
@@ -214,7 +214,7 @@ def R_lab_view(camera: Camera, uv_px: Tensor) -> Tensor:
 
 
 def without_perspective(camera: Camera, uv_px: Tensor, R_lab_body: Tensor) -> Tensor:
-    """Return orientations (..., 3, 3) as if each line of sight, at pixels (..., 2), were parallel to the camera's axis.
+    """Return orientations (..., 3, 3) as if the lines of sight at pixels (..., 2) were parallel to the camera's axis.
     Source: the paper, section III, R_persp; its sign by docs/errata.md A1.
     """
     R_cam_lab = camera.R_cam_lab
@@ -228,8 +228,8 @@ def centre_lab_mm(camera: Camera) -> Tensor:
 
 
 def perspective_centre_lab_mm(camera: Camera, position_lab_mm: Tensor) -> Tensor:
-    """Return where the lines of sight about positions (..., 3), mm, lab, meet, (..., 3): the projection centre, behind
-    a port its image; of parallel lines a point far away.
+    """Return the point (..., 3) in which the lines of sight near positions (..., 3), mm, lab, meet: the projection
+    centre, behind a port its image; a point far away if they are parallel.
     """
     X = position_lab_mm.double()
     uv = camera.project(X)
@@ -237,7 +237,7 @@ def perspective_centre_lab_mm(camera: Camera, position_lab_mm: Tensor) -> Tensor
     origin, direction = near.origin_lab_mm, near.direction_lab
     if torch.equal(origin[0], origin[1]):
         return origin[0]
-    aside = _cross(X - origin[1:], direction[1:]).norm(dim=-1).mean(0)  # of X, from the lines through the next pixels
+    aside = _cross(X - origin[1:], direction[1:]).norm(dim=-1).mean(0)  # of X, from lines of the next pixels
     sine = _cross(direction[:1].expand_as(direction[1:]), direction[1:]).norm(dim=-1).mean(0)
     distance: Tensor = aside / sine.maximum(PARALLEL * aside)
     return X - distance[..., None] * direction[0]
@@ -258,7 +258,7 @@ def sphere_radius_px(camera: Camera, position_lab_mm: Tensor, radius_mm: float) 
 
 
 def holds_disk(camera: Camera, centre_px: Tensor, radius_px: Tensor) -> Tensor:
-    """Return whether the picture holds the whole disk, (...) bool, of centres (..., 2) and radii (...), px."""
+    """Return whether the whole disk lies in the picture, (...) bool, for centres (..., 2) and radii (...), px."""
     low, high = centre_px - radius_px[..., None], centre_px + radius_px[..., None]
     return ((low >= 0) & (high < centre_px.new_tensor(camera.image_size))).all(-1)
 

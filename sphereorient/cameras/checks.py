@@ -14,8 +14,8 @@ MAX_SIDE_PX = 65_536  # of a picture: twice what any camera has
 
 
 def as_parameter(name: str, value: Tensor | float | Sequence[float], *shape: int) -> Tensor:
-    """Return a parameter as float64 tensor, still part of its graph; refuse other shapes and numbers beyond LARGEST."""
-    # as_tensor alone would round plain numbers to float32 first.
+    """Return a parameter as float64 tensor, still in its graph; refuse other shapes and numbers beyond LARGEST."""
+    # as_tensor alone rounds plain numbers to float32.
     tensor = value.to(torch.float64) if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64)
     if tuple(tensor.shape) != shape:
         raise camera_error(name, f"shape {shape}", f"shape {tuple(tensor.shape)}")
@@ -59,7 +59,7 @@ def check_points(name: str, points: Tensor, size: int) -> None:
 
 @contextmanager
 def named(where: str) -> Iterator[None]:
-    """Put the place before the message of a CameraError."""
+    """Put the location in front of the message of a CameraError."""
     try:
         yield
     except CameraError as error:

@@ -1,4 +1,4 @@
-"""The fisheye camera: angles in place of slopes."""
+"""The fisheye camera: angles instead of slopes."""
 
 import math
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ NEAR_AXIS = 0.03  # rad; below it the series in the angle are exact to 1e-16
 class FisheyeCamera(PolynomialCamera):
     """Kannala-Brandt's lens, OpenCV's `fisheye` model: a point at the angle theta from the axis, below pi, appears at
     the distance f theta (1 + k1 theta^2 + ... + k4 theta^8) from `centre_px`. With k = 0 it is equidistant. Pixels
-    beyond the fold of the polynomial, or theta = pi, see nothing (NaN): often the corners of the picture.
+    beyond the fold of the polynomial, or theta = pi, have no line of sight (NaN): often the corners.
     Source: Kannala and Brandt 2006, eq. (6), without their asymmetric terms.
     """
 
@@ -58,14 +58,14 @@ class FisheyeCamera(PolynomialCamera):
         return self.f_px
 
     def across_lab(self, x_lab_mm: Tensor) -> Tensor:
-        """Return unit directions (..., 3) about the axis: there the picture of a sphere is widest."""
+        """Return unit directions (..., 3) about the axis, in which the picture of a sphere is widest."""
         R_cam_lab = self.R_cam_lab.to(x_lab_mm)
         x, y, _ = (x_lab_mm.detach() @ R_cam_lab.mT + self.T_cam_lab_mm.to(x_lab_mm)).unbind(-1)
         angle = torch.atan2(x, -y)  # 0 on the axis: the camera's x
         return torch.stack([angle.cos(), angle.sin(), torch.zeros_like(x)], -1) @ R_cam_lab
 
     def _flattened(self, x_cam_mm: Tensor) -> tuple[Tensor, Tensor]:
-        """Return points at their angle from the axis, rad, in their direction about it; not seen is the axis behind."""
+        """Return points at their angle from the axis, rad, in their direction about it; seen unless behind on it."""
         aside2, depth = x_cam_mm[..., :2].square().sum(-1, keepdim=True), x_cam_mm[..., 2:]
         near = (depth > 0) & (aside2 < NEAR_AXIS**2 * depth.square())
         seen = near | (aside2 > torch.finfo(depth.dtype).eps * depth.square())  # less is rounding only

@@ -1,5 +1,5 @@
-"""What all camera models share: pose, principal point, and one table of keys that defines the file and the parameters;
-and the models without distortion.
+"""What all camera models share: pose, principal point, and a table of keys that defines file and parameters; and the
+models without distortion.
 
 To add a model, derive a dataclass with `MODEL` and `KEYS` from `CentralCamera` (one projection centre) or
 `CameraModel`, and add it to `MODELS` in io/cameras_yaml.py. `KEYS` define file, parameter names and checks.
@@ -31,8 +31,8 @@ class Key:
     name: str
     field: str
     parts: tuple[str, ...] = ()  # parameter names of a list; empty: one number, whose parameter has the key's name
-    place: int | None = None  # index in the field, where several keys share one field
-    default: float | None = None  # of each number, where the key may be left out
+    place: int | None = None  # index in the field, if several keys share it
+    default: float | None = None  # of each number, if the key is optional
     optional: bool = False  # `completed` fills in the value
     positive: bool = False
 
@@ -55,7 +55,7 @@ class CameraModel(ABC):
         check_image_size("image_size", self.image_size)
         object.__setattr__(self, "image_size", tuple(self.image_size))
         shapes: dict[str, tuple[int, ...]] = {"R_cam_lab": (3, 3), "T_cam_lab_mm": (3,)}
-        for key in self.KEYS:  # of keys that share a field the last one has the highest index
+        for key in self.KEYS:  # the last of the keys that share a field has the highest index
             size = len(key.parts) if key.place is None else key.place + 1
             shapes[key.field] = (size,) if size else ()
         for name, shape in shapes.items():
@@ -90,16 +90,16 @@ class CameraModel(ABC):
         """Return the rays of pixels (..., 2)."""
 
     def across_lab(self, x_lab_mm: Tensor) -> Tensor:
-        """Return the camera's x axis, (3,): along it a sphere shows its radius."""
+        """Return the camera's x axis, (3,), in which a sphere's radius appears."""
         return self.R_cam_lab[0].to(x_lab_mm)
 
     def undistort(self, uv_px: Tensor) -> Tensor:
-        """Return the pixels (..., 2) of the camera without distortion; this default changes nothing."""
+        """Return the pixels (..., 2) of the camera without distortion; by default unchanged."""
         check_points("uv_px", uv_px, 2)
         return uv_px
 
     def distort(self, uv_px: Tensor) -> Tensor:
-        """Return the pixels (..., 2) that `undistort` takes to `uv_px`; this default changes nothing."""
+        """Return the pixels (..., 2) whose undistorted ones are `uv_px`; by default unchanged."""
         check_points("uv_px", uv_px, 2)
         return uv_px
 
@@ -130,12 +130,12 @@ class CentralCamera(CameraModel):
         """Return the rays (..., 3) of pixels (..., 2), which start at the projection centre."""
         check_points("uv_px", uv_px, 2)
         flat = (self.undistort(uv_px) - self.centre_px.to(uv_px)) / self.focal_px.to(uv_px)
-        direction_lab = self._direction_cam(flat) @ self.R_cam_lab.to(uv_px)  # rows: R_lab_cam of every direction
+        direction_lab = self._direction_cam(flat) @ self.R_cam_lab.to(uv_px)  # rows: R_lab_cam times each direction
         return Rays(origin_lab_mm=self.centre_lab_mm.to(uv_px).expand_as(direction_lab), direction_lab=direction_lab)
 
     def _flattened(self, x_cam_mm: Tensor) -> tuple[Tensor, Tensor]:
-        """Return points (..., 3) on the plane that `focal_px` scales, here slopes, and whether they are seen, (..., 1);
-        others have finite values there, or the gradient of the unused branch is NaN.
+        """Return points (..., 3) on the plane that `focal_px` scales, here as slopes, and whether they are seen, (...,
+        1); others are finite too, or the gradient of the unused branch is NaN.
         """
         depth = x_cam_mm[..., 2:]
         before = depth > 0
@@ -179,7 +179,7 @@ class PinholeCamera(CentralCamera):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TelecentricCamera(CameraModel):
-    """Orthographic projection: u = X_cam / scale + centre, at every depth; T_z changes no picture."""
+    """Orthographic projection: u = X_cam / scale + centre, at every depth; T_z has no effect on pictures."""
 
     scale_mm_px: Tensor  # (), mm in the lab per pixel
 

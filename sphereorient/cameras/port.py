@@ -8,13 +8,13 @@ from sphereorient.cameras.camera import Camera, ParameterCovariance, Rays
 from sphereorient.cameras.checks import as_parameter, camera_error, check_points
 from sphereorient.cameras.model import CentralCamera, Key
 
-UNIT_TOLERANCE = 1e-3  # of |normal| - 1: three digits are enough to write a normal; its length is not used
-STEPS = 12  # of Newton's method, before those that carry derivatives; 11 suffice up to 89.9 degrees of incidence
+UNIT_TOLERANCE = 1e-3  # of |normal| - 1, for normals written with three digits; the length is not used
+STEPS = 12  # of Newton's method, before the differentiable ones; 11 suffice up to 89.9 degrees of incidence
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Port:
-    """A flat transparent wall, air before it, liquid behind it; float64, may require gradients."""
+    """A flat transparent wall with air in front of it and liquid behind it; float64, may require gradients."""
 
     normal: Tensor  # (3,), lab, unit length to three digits, towards the camera
     offset_mm: Tensor  # (), normal . X of the wall's liquid side, lab
@@ -65,8 +65,8 @@ class Port:
         cosine = -(d @ normal)[..., None]
         passes = cosine > 0
         cosine = torch.where(passes, cosine, torch.ones_like(cosine))
-        along_wall = torch.where(passes, d, -normal) + cosine * normal  # its length is the sine in air
-        # n cos(angle inside) = sqrt(n^2 - sin^2), in a form that gives the cosine itself at n = 1.
+        along_wall = torch.where(passes, d, -normal) + cosine * normal  # length: the sine in air
+        # n cos(angle inside) = sqrt(n^2 - sin^2), in a form that is exactly the cosine at n = 1.
         in_glass = (n_glass.square() - 1 + cosine.square()).sqrt()
         in_fluid = (n_fluid.square() - 1 + cosine.square()).sqrt()
         height = (air.origin_lab_mm @ normal)[..., None] - self.air_side_mm.to(d)
@@ -92,10 +92,10 @@ class Port:
         return torch.where(inside[..., None], point, torch.full_like(point, torch.nan))
 
     def _share_in_air(self, across2: Tensor, height: Tensor, depth: Tensor) -> Tensor:
-        """Return the fraction of the distance along the wall that light covers in air, in (0, 1].
-        With s the sine in air the distance is height tan + thickness s / sqrt(n_g^2 - s^2) + depth s / sqrt(n_f^2 -
-        s^2). Divided by the distance it is g(share) = 1 below, without square root of the distance: gradients exist
-        also at s = 0. g rises and is concave: Newton converges from below, from the share of steep rays.
+        """Return the fraction in air of the light's path along the wall, in (0, 1].
+        With s the sine in air the path is height tan + thickness s / sqrt(n_g^2 - s^2) + depth s / sqrt(n_f^2 - s^2).
+        Divided by its length it is g(share) = 1 below, free of square roots of the length, so that gradients exist at s
+        = 0. g is increasing and concave: Newton converges from below, from the share of steep rays.
         """
         layers = [(self.thickness_mm.to(depth), self.n_glass.to(depth)), (depth, self.n_fluid.to(depth))]
 
@@ -113,7 +113,7 @@ class Port:
             share = newton(torch.zeros_like(depth))  # steep rays: 1 / (1 + thickness / (n_g H) + depth / (n_f H))
             for _ in range(STEPS):
                 share = newton(share)
-        # The first further step carries the first derivative of the root, the second step its second derivative.
+        # One further step carries the root's first derivative, another the second.
         return newton(newton(share))
 
 
@@ -123,9 +123,9 @@ class PortCamera:
     `undistort` and `distort` correct the lens, not the refraction, which depends on depth.
     """
 
-    camera: Camera  # as it would be in air
+    camera: Camera  # in air
     port: Port
-    covariance: ParameterCovariance | None = None  # of the camera's and the port's parameters together
+    covariance: ParameterCovariance | None = None  # of the parameters of camera and port
     image_size: tuple[int, int] = field(init=False)
     R_cam_lab: Tensor = field(init=False)
     T_cam_lab_mm: Tensor = field(init=False)
@@ -156,11 +156,11 @@ class PortCamera:
         return self.camera.distort(uv_px)
 
     def across_lab(self, x_lab_mm: Tensor) -> Tensor:
-        """Return that of the camera in air."""
+        """Return the direction of the camera in air."""
         return self.camera.across_lab(x_lab_mm)
 
     def rays(self, uv_px: Tensor) -> Rays:
-        """Return the rays in the liquid of pixels (..., 2), from the wall's liquid side; NaN beside the wall."""
+        """Return the rays in the liquid of pixels (..., 2), from the wall's liquid side; NaN outside the wall."""
         return self.port.refract(self.camera.rays(uv_px))
 
     def project(self, x_lab_mm: Tensor) -> Tensor:
@@ -171,15 +171,15 @@ class PortCamera:
         return self.camera.project(self._apparent_point(x_lab_mm))
 
     def _apparent_point(self, x_lab_mm: Tensor) -> Tensor:
-        """Return the points in air with the image of `x_lab_mm` in the liquid, for cameras without one centre.
-        Each iteration shifts the point along the wall by the miss of its ray. This leaves at most 1 - 1/n of the miss
-        for steep rays, and nothing for parallel rays.
+        """Return the points in air with the same image as `x_lab_mm` in the liquid, for cameras without one centre.
+        Each iteration shifts the point along the wall by its ray's distance from the target. At most 1 - 1/n of the
+        distance is left for steep rays, nothing for parallel rays.
         """
         normal = self.port.normal_lab.to(x_lab_mm)
         inside = (x_lab_mm @ normal <= self.port.offset_mm.to(x_lab_mm))[..., None]
         apparent = x_lab_mm
         missed = torch.zeros_like(x_lab_mm)
-        for _ in range(40):  # of the iteration for cameras without one centre; one is exact for parallel rays
+        for _ in range(40):  # iterations; one is exact for parallel rays
             ray = self.rays(self.camera.project(apparent))
             to_go = ((x_lab_mm - ray.origin_lab_mm) @ normal) / (ray.direction_lab @ normal)
             missed = x_lab_mm - ray.origin_lab_mm - to_go[..., None] * ray.direction_lab
@@ -190,5 +190,5 @@ class PortCamera:
 
 
 def in_air(camera: Camera) -> Any:
-    """Return the camera model itself, without the wall before it."""
+    """Return the camera model itself, without the wall."""
     return camera.camera if isinstance(camera, PortCamera) else camera

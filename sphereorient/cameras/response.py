@@ -1,4 +1,4 @@
-"""The response of a camera: which light made a grey level."""
+"""The response of a camera: the light of each grey level."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-NODES = 1 << 12  # of a table for 16 bit pictures and for means of pictures; between them it is linear
+NODES = 1 << 12  # of the piecewise linear table for 16 bit pictures and means of pictures
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Response:
         return np.asarray(np.interp(grey, np.linspace(0.0, full_scale, NODES), known), np.float32)
 
     def __str__(self) -> str:
-        """Return it as experiment.yaml has it."""
+        """Return the response as written in experiment.yaml."""
         if self.table:
             return f"a table of {len(self.table)} levels"
         return "srgb" if self.srgb else "linear" if self.linear else f"gamma {self.gamma:.3g}"

@@ -18,11 +18,11 @@ from sphereorient.movies import Movie, flipped, is_movie, movie_files, open_movi
 from sphereorient.sphere import seen_path
 
 SCHEMA = "sphereorient-experiment/1"
-MAX_CAMERAS = 8  # of an experiment: all subsets of them may be tried
+MAX_CAMERAS = 8  # of an experiment, as all subsets may be tried
 MOVIES_OWN = "movies"  # value of `times`
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 FrameNumber = Annotated[int, Field(ge=0)]
-MAP = "texture.png"  # of an experiment that names none
+MAP = "texture.png"  # default map of an experiment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,17 +33,17 @@ class Sphere:
     diameter_mm: float | None = None  # None: unknown, lengths are in radii
     texture_path: Path | None = None  # None: to be estimated
     fixed: bool = False  # whether the centre is fixed
-    sways: bool = False  # whether it moves little or slowly about a place, in a holder
+    sways: bool = False  # whether it moves little or slowly, in a holder
 
     @property
     def in_place(self) -> bool:
-        """Whether it stays in its place: it is what changes in the pictures."""
+        """Whether it stays in its place and is found by the pixels that change."""
         return self.fixed or self.sways
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Experiment:
-    """Content of experiment.yaml; made by `load_experiment` or synth."""
+    """Content of experiment.yaml."""
 
     name: str
     path: Path
@@ -53,18 +53,18 @@ class Experiment:
     movie_paths: dict[str, Path]
     exposure_s: float | None = None
     spheres: tuple[Sphere, ...] = (Sphere(),)
-    mask_paths: dict[str, Path] = field(default_factory=dict)  # black where something static hides the sphere
+    mask_paths: dict[str, Path] = field(default_factory=dict)  # black where a static object hides the sphere
     background_paths: dict[str, Path] = field(default_factory=dict)  # scene without the sphere
     circles: dict[str, tuple[float, float, float]] = field(default_factory=dict)  # of a fixed ball: u, v, radius, px
-    times: str | None = None  # path of a table, or "movies": their time stamps; None: constant frame rate
-    time_unit: str = ""  # of times whose file states none, see movies.stamps.UNITS; empty: s, unless that is doubtful
+    times: str | None = None  # path of a table, or "movies" for their time stamps; None: constant frame rate
+    time_unit: str = ""  # of times without a stated unit, see movies.stamps.UNITS; empty: s, unless doubtful
     start: dict[str, int] = field(default_factory=dict)  # frame of each movie that is the experiment's frame 0
-    start_given: bool = False  # whether the file has `start`; time stamps then begin there
+    start_given: bool = False  # whether the file has `start`, at which time stamps then begin
     flip: dict[str, str] = field(default_factory=dict)  # mirrored movies, see movies.flipped
-    response: dict[str, Response] = field(default_factory=dict)  # of the cameras for which the file gives one
+    response: dict[str, Response] = field(default_factory=dict)  # of the cameras with a given response
     frames: tuple[int, int] | None = None  # first, last + 1; None: all
     flow: dict[str, float] = field(default_factory=dict)  # SI
-    devices: dict[str, "DeviceKeys"] = field(default_factory=dict)  # of the cameras for which the file has `camera`
+    devices: dict[str, "DeviceKeys"] = field(default_factory=dict)  # of the cameras with a key `camera`
     camera_covariance: ParameterCovariance | None = None  # parameters are named camera.parameter
 
     @property
@@ -79,11 +79,11 @@ class Experiment:
 
     @property
     def alone(self) -> bool:
-        """Whether it has one sphere: no other one hides it, or is taken for it."""
+        """Whether there is one sphere only, so that no other can hide it or be confused with it."""
         return len(self.spheres) == 1
 
     def of(self, name: str) -> "Experiment":
-        """Return the experiment of one sphere alone; ExperimentError if it has none of this name."""
+        """Return the experiment with one of its spheres; ExperimentError if there is none of this name."""
         if name == UNNAMED:
             return replace(self, spheres=(self.sphere,))
         if self.names == (UNNAMED,):
@@ -121,12 +121,12 @@ class Experiment:
 
     @property
     def mapless(self) -> bool:
-        """Whether its only sphere has no texture map: one is learnt from the movies."""
+        """Whether the only sphere has no texture map, which is then learnt from the movies."""
         return self.alone and (self.texture_path is None or not self.texture_path.exists())
 
     def new_map_path(self) -> Path:
-        """Return where the map that is learnt is written: as named, or beside the experiment.
-        Raises ExperimentError: there is a file, which the experiment does not name.
+        """Return the path for a learnt map: as named, or beside the experiment. Raises ExperimentError: a file exists
+        that the experiment does not name.
         """
         path = self.texture_path or self.folder / MAP
         if path.exists():
@@ -135,7 +135,7 @@ class Experiment:
 
     @property
     def length_unit(self) -> str:
-        """Unit of all lengths of a track: mm, or radii of an only sphere of unknown diameter."""
+        """Unit of all lengths of a track: mm, or radii for an only sphere of unknown diameter."""
         return "radii" if any(sphere.diameter_mm is None for sphere in self.spheres) else "mm"
 
     @property
@@ -168,9 +168,9 @@ class FlowKeys(BaseModel, frozen=True, extra="forbid"):
 
 
 class DeviceKeys(BaseModel, frozen=True, extra="forbid"):
-    """The key `camera` of a camera: what `live` sets on its device, beside the size of the pictures; None: nothing."""
+    """The key `camera` of a camera: settings of its device for `live`, beside the picture size; None: not set."""
 
-    trigger: str | None = None  # the device's name of the line, or none: it runs freely
+    trigger: str | None = None  # the device's name of the line; none: free running
     exposure_ms: Positive | None = None
     rate_hz: Positive | None = None
     pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono14", "Mono16"] | None = None
@@ -201,8 +201,8 @@ class ExperimentKeys(BaseModel, frozen=True, extra="forbid"):
 
 
 def load_experiment(source: Experiment | Path | str) -> Experiment:
-    """Read experiment.yaml and its cameras, unless it is read already; movies and pictures are not opened.
-    Raises ExperimentError (missing, malformed or inconsistent file), CameraError (likewise, of its cameras).
+    """Read experiment.yaml and its cameras, unless already read; movies and pictures are not opened.
+    Raises ExperimentError (missing, malformed or inconsistent file), CameraError (the same for its cameras).
     """
     if isinstance(source, Experiment):
         return source
@@ -305,7 +305,7 @@ def outside_paths(experiment: Experiment) -> list[Path]:
 
 
 def _responses(where: str, given: Any, cameras: Sequence[str]) -> dict[str, Response]:
-    """Return the response of each camera for which the key gives one; one response is that of all."""
+    """Return the response of each camera with a given one; a single response is for all."""
     if given is None:
         return {}
     if not isinstance(given, dict) or given.keys() == {"gamma"}:
@@ -315,7 +315,7 @@ def _responses(where: str, given: Any, cameras: Sequence[str]) -> dict[str, Resp
 
 
 def response_of(where: str, given: Any) -> Response:
-    """Return the response that a value of the key `response` describes; ExperimentError, with `where`: none does."""
+    """Return the response described by a value of the key `response`; ExperimentError, with `where`, if invalid."""
     with suppress(ValueError, TypeError, AttributeError):
         if given in ("linear", "srgb"):
             return Response(srgb=given == "srgb")
@@ -325,7 +325,7 @@ def response_of(where: str, given: Any) -> Response:
         if table.shape == (len(table), 2) and not table[0].any() and bool((np.diff(table, axis=0) > 0).all()):
             return Response(table=tuple(map(tuple, table / table[-1])))
     expected = "linear, srgb, {gamma: NUMBER}, or a table [[0, 0], ...] of grey level and light, both increasing"
-    raise input_error(where, expected, short(given), "write one of these, or leave it out: it is learnt then")
+    raise input_error(where, expected, short(given), "write one of these, or remove the key: it is then learnt")
 
 
 def _check_numbers(path: Path, keys: ExperimentKeys) -> None:
@@ -340,7 +340,7 @@ def _check_numbers(path: Path, keys: ExperimentKeys) -> None:
     for name, device in keys.camera.items():
         if device.exposure_ms and device.rate_hz and device.exposure_ms > 1e3 / device.rate_hz:
             where, expected = f"{path}, camera.{name}.exposure_ms", f"at most {1e3 / device.rate_hz:.4g} ms, by rate_hz"
-            raise input_error(where, expected, f"{device.exposure_ms:g}", "expose for less, or at a lower rate")
+            raise input_error(where, expected, f"{device.exposure_ms:g}", "shorten the exposure, or lower the rate")
 
 
 def _check_spheres(path: Path, keys: ExperimentKeys) -> None:

@@ -1,6 +1,4 @@
-"""Experiments with open movies: a camera with its pictures (those of its movie, frame by frame, and the given ones of
-its scene and of what hides the ball), and the recording of all cameras.
-"""
+"""Experiments with open movies: a camera with its pictures (movie, scene, mask), and the recording of all cameras."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -32,18 +30,18 @@ from sphereorient.files.whole_file import read_whole
 from sphereorient.movies import Grey, Movie, flipped_picture, flipped_shape
 from sphereorient.sphere import load_texture, load_unseen, unseen_share
 
-Shown = Grey | OnDemand  # a picture that was decoded, or is where it is asked for
+Shown = Grey | OnDemand  # a picture, decoded whole or on demand
 Read = TypeVar("Read", bound=Shown)
 
-BYTES_A_PIXEL, HEADER_BYTES = 8, 1_000_000  # of a given picture, uncompressed, and of its header
-EVERY = 4  # pixels: faults of whole pictures show in every fourth row and column
-GLARE_SHARE = 0.5  # share of saturated pixels that excludes a picture from the background
-UNKNOWN = 0.5  # grey of texels that are no paint, for searches
+BYTES_A_PIXEL, HEADER_BYTES = 8, 1_000_000  # of a given picture, uncompressed; of its header
+EVERY = 4  # tested rows and columns: faults of whole pictures show in every fourth one
+GLARE_SHARE = 0.5  # share of saturated pixels from which a picture is not used for the background
+UNKNOWN = 0.5  # grey of texels without paint, in searches
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraStream:
-    """A camera, its movie, and the picture of each frame; made by `open_recording`."""
+    """A camera, its movie, and the picture of each frame."""
 
     name: str
     camera: Camera
@@ -67,7 +65,7 @@ class CameraStream:
     def on_demand(
         self, pool: Executor, first: int = 0, last: int | None = None
     ) -> Iterator[tuple[Grey | OnDemand | None, Reason]]:
-        """Yield the same, of movies that allow it as pictures that are decoded in `pool` part by part."""
+        """Yield the same, decoded in `pool` part by part for movies that allow it."""
         return self._with_reasons(partial(self.movie.on_demand, pool), first, last)
 
     def _with_reasons(
@@ -115,7 +113,7 @@ def whole(shown: Shown) -> Grey:
 
 
 def equal(shown: Shown, before: Shown | None) -> bool:
-    """Return whether a picture repeats the one before it."""
+    """Return whether a picture repeats the previous one."""
     if isinstance(shown, OnDemand) or isinstance(before, OnDemand) or before is None:
         return isinstance(shown, OnDemand) and shown.equals(before)
     some = np.s_[:: EVERY**2]
@@ -128,7 +126,7 @@ def pictures_of(movie: Movie, rows: NDArray[np.int64]) -> Iterator[Grey | None]:
 
 
 def parts_of(pool: Executor, movie: Movie, rows: NDArray[np.int64]) -> Iterator[Shown | None]:
-    """Yield the same, of movies that allow it as pictures that are decoded in `pool` part by part."""
+    """Yield the same, decoded in `pool` part by part for movies that allow it."""
     return _of_rows(partial(movie.on_demand, pool), rows)
 
 
@@ -171,11 +169,11 @@ def load_mask(path: Path, frame_shape: tuple[int, int]) -> NDArray[np.bool_]:
     """Read a mask, (H, W), True (white) where the sphere is visible, False (black) where something hides it.
     Raises ExperimentError (missing, not a picture, not of the movie's size, or all black).
     """
-    name, do = f"mask {path}", "paint what hides the ball black, all else white, on a frame of the movie"
+    name, do = f"mask {path}", "paint a frame of the movie black where something hides the ball, white elsewhere"
     picture = _picture(path, name, frame_shape, do)
     shown = np.asarray(picture > np.iinfo(picture.dtype).max // 2)
     if not shown.any():
-        raise input_error(name, "white where the ball is seen", "black only", do)
+        raise input_error(name, "white where the ball is visible", "black only", do)
     return shown
 
 
@@ -195,15 +193,15 @@ def _picture(path: Path, name: str, frame_shape: tuple[int, int], do: str) -> ND
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TextureMap:
-    """The texture map of a sphere, as read from its file."""
+    """The texture map of a sphere, from its file."""
 
     grey: Tensor  # (H, 2 H); (0, 0) if it is to be estimated
-    unseen: Tensor | None = None  # (H, 2 H) bool, texels that are no paint; None: all are
+    unseen: Tensor | None = None  # (H, 2 H) bool, texels without paint; None: none
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
-    """Experiment with open movies; made by `open_recording`."""
+    """Experiment with open movies."""
 
     experiment: Experiment
     streams: Sequence[CameraStream]
@@ -223,7 +221,7 @@ class Recording:
 
     @property
     def unseen(self) -> Tensor | None:
-        """Texels of this map that are no paint, (H, 2 H) bool; None: all are paint."""
+        """Texels of this map without paint, (H, 2 H) bool; None: all are paint."""
         return self.maps[self.experiment.sphere.name].unseen
 
     @property
@@ -233,7 +231,7 @@ class Recording:
 
     @property
     def photograph(self) -> bool:
-        """Whether one picture of one camera is all there is."""
+        """Whether the recording is one picture of one camera."""
         return len(self.streams) == 1 and self.streams[0].photograph
 
     @property
@@ -260,7 +258,7 @@ class Recording:
         return replace(self, timeline=grid, streams=streams), place
 
 
-TAKEN_FOR_CODED = "a photograph, taken for gamma-coded; write response: linear if its grey levels are the light"
+TAKEN_FOR_CODED = "a photograph, assumed gamma-coded; write response: linear if grey levels are proportional to light"
 NO_MAP = TextureMap(grey=torch.empty(0, 0))
 
 
@@ -285,9 +283,9 @@ def open_recording(
         camera, rows = experiment.cameras[name], frames.rows[name]
         response = experiment.response.get(name)
         streams.append(CameraStream(name=name, camera=camera, movie=movie, rows=rows, shown=shown, response=response))
-    remarks = [f"{experiment.path}: reads outside of its folder: {path}" for path in outside_paths(experiment)]
+    remarks = [f"{experiment.path}: reads a file outside its folder: {path}" for path in outside_paths(experiment)]
     remarks += [
-        f"{path}: {100 * unseen_share(one.unseen):.0f} % of the ball is unseen and no paint"
+        f"{path}: {100 * unseen_share(one.unseen):.0f} % of the ball has unseen paint"
         for path, one in loaded.items()
         if one.unseen is not None
     ]
@@ -306,12 +304,12 @@ def _texture_path(experiment: Experiment, sphere: Sphere) -> Path:
     if sphere.texture_path is not None:
         return sphere.texture_path
     key, name = (f"spheres.{sphere.name}", f", ball {sphere.name}") if sphere.name else ("sphere", "")
-    do = f"learn it with `sphereorient map`, then write {key}.texture: the file that this gives"
+    do = f"learn it with `sphereorient map`, then write its file as {key}.texture"
     raise input_error(f"{experiment.path}{name}", "a texture", "none", do)
 
 
 def load_map(path: Path) -> TextureMap:
-    """Read a texture map, with what of it is no paint; TextureError for a file that is none."""
+    """Read a texture map, with its texels without paint; TextureError for another file."""
     grey, unseen = load_texture(path), load_unseen(path)
     return TextureMap(grey=grey if unseen is None else grey.masked_fill(unseen, UNKNOWN), unseen=unseen)
 

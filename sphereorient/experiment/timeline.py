@@ -18,7 +18,7 @@ Rows = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
 NONE = -1  # in `Timeline.rows`: no picture
-PAIR_STEPS = 0.5  # frame periods: nearer stamps of several cameras are one instant
+PAIR_STEPS = 0.5  # frame periods: nearer stamps of several cameras count as one instant
 LATE_STEPS = 0.05  # frame periods: a larger median difference of stamps causes a remark
 EVEN_STEPS = 1e-3  # frame periods: tolerance of evenly spaced times
 ON_GRID = 0.02  # frame periods: tolerance of a regular grid
@@ -28,7 +28,7 @@ LONGEST_PAUSE = 50  # frame periods; no motion continues over a longer pause
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Timeline:
-    """N frames of an experiment; made by `timeline`."""
+    """N frames of an experiment."""
 
     number: Rows  # (N,), frame numbers, increasing
     time_s: Floats  # (N,), mid-exposure times, s, increasing
@@ -45,7 +45,7 @@ class Timeline:
 
     def gridded(self) -> "tuple[Timeline, Rows]":
         """Resample onto a regular grid, inserting missing frames; return it and the frames' indices in it.
-        Raises ExperimentError (the times lie on no regular grid).
+        Raises ExperimentError (times on no regular grid).
         """
         steps = np.rint(np.diff(self.time_s) / self.frame_s).clip(1, LONGEST_PAUSE).astype(np.int64)
         place: Rows = np.concatenate([[0], np.cumsum(steps)])
@@ -70,11 +70,11 @@ class Timeline:
 def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     """Return the times of the selected frames and the pictures of the cameras at each frame.
 
-    Times come from the frame rate, a table, or stamps of the movies; equal stamps of several cameras make one frame.
-    A remark questions a rate that no camera has, and a frame rate that contradicts the stamps of a movie.
+    Times come from the frame rate, a table, or stamps of the movies; equal stamps of several cameras make one frame. A
+    remark is added for a rate implausible for cameras, and for a frame rate that contradicts a movie's stamps.
 
-    Raises ExperimentError (unreadable table of times, one of another length, or times that are hardly in s and state
-    no unit), MovieError (a movie lacks frames, or time stamps with `times: movies`).
+    Raises ExperimentError (unreadable table of times, one of another length, or times without a unit that are hardly in
+    s), MovieError (a movie without enough frames, or without time stamps for `times: movies`).
     """
     whole = _stamped(experiment, movies) if experiment.times == MOVIES_OWN else _counted(experiment, movies)
     whole = replace(whole, remarks=(*whole.remarks, *_questioned(experiment, whole.frame_s, movies)))
@@ -82,7 +82,7 @@ def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
         return whole
     first, last = experiment.frames
     if len(whole) < last:
-        expected, do = f"{last} frames as frames: says", "lower the end of frames:"
+        expected, do = f"{last} frames, by frames:", "lower the end of frames:"
         raise MovieError(refusal(f"{experiment.path}, movies", expected=expected, got=f"{len(whole)}", do=do))
     rows = {name: row[first:last] for name, row in whole.rows.items()}
     return replace(whole, number=whole.number[first:last], time_s=whole.time_s[first:last], rows=rows)
@@ -115,17 +115,17 @@ def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
 
 
 def _questioned(experiment: Experiment, frame_s: float, movies: Mapping[str, Movie]) -> Iterator[str]:
-    """Yield remarks on a rate that no camera has, or that contradicts the time stamps of a movie."""
+    """Yield remarks on a rate implausible for cameras, or contradicting the time stamps of a movie."""
     if (why := doubt(1 / frame_s)) and max(map(len, movies.values())) > 1:
-        yield f"{experiment.path}: the frames come at {why}"
+        yield f"{experiment.path}: the frame rate is {why}"
     for movie in movies.values():
         rate_hz = rate_of(movie.times_s) if movie.times_s is not None and movie.times_unit else float("nan")
         if abs(rate_hz / experiment.frame_rate_hz - 1) > CONTRADICTION:
-            yield f"{movie.path}: its time stamps say {rate_hz:.6g} Hz, {experiment.path} {1 / frame_s:.6g} Hz"
+            yield f"{movie.path}: {rate_hz:.6g} Hz by its time stamps, {1 / frame_s:.6g} Hz in {experiment.path}"
 
 
 def load_times(path: Path, unit: str = "") -> Floats:
-    """Read a table of times, (N,), s, one a line; the first line may name their unit, such as time_ms, or else `unit`.
+    """Read a table of times, (N,), s, one a line; its first line may name the unit, such as time_ms; else it is `unit`.
     Raises ExperimentError (missing, too large, a line without a number, times not increasing, or hardly in s).
     """
     do = "write one time a line, increasing"
@@ -139,15 +139,15 @@ def load_times(path: Path, unit: str = "") -> Floats:
             if number > 1:  # the first line may be a heading
                 raise input_error(f"{path}, line {number}", "a number", repr(text[:40]), do) from None
     times = _increasing(str(path), np.asarray(values, np.float64), do)
-    unit = unit_in(lines[0]) or unit  # there is a time, or it was refused
+    unit = unit_in(lines[0]) or unit  # without a time it was refused
     return _in_s(str(path), times, unit)
 
 
 def _in_s(name: str, times: Floats, unit: str) -> Floats:
-    """Return times, (N,), in s; ExperimentError for ones without a unit that are hardly in s."""
+    """Return times, (N,), in s; ExperimentError for times without a unit that are hardly in s."""
     rate_hz = rate_of(times)
     if not unit and (others := other_units(rate_hz)):
-        do = "write time_unit: ms (or us, ns, s) in experiment.yaml, as they are"
+        do = "write the right time_unit: (ms, us, ns or s) in experiment.yaml"
         raise input_error(name, "times in s", f"{doubt(rate_hz)}; by their size they are in {others}", do)
     return times * UNITS[unit or "s"]
 
@@ -182,7 +182,7 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
             raise MovieError(refusal(str(movie.path), expected=f"more than {start} frames", got=got, do=do))
         where, unit = f"{movie.path}, time stamps", "s" if movie.times_unit else experiment.time_unit
         stamps = _in_s(where, _increasing(where, own, "write frame_rate:, or times: with a file"), unit)
-        # `start`: each clock begins at that picture; otherwise all stamps count from the trigger.
+        # With `start` each clock begins at that picture; otherwise all stamps count from the trigger.
         clocks[name] = stamps[start:] - stamps[start] if experiment.start_given else stamps[start:]
     usual_s, names = float(np.median(np.concatenate([np.diff(clock) for clock in clocks.values()]))), list(clocks)
     chosen = {names[0]: np.arange(len(clocks[names[0]]))}
@@ -203,9 +203,9 @@ def _stamped(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
         apart = np.abs(taken[0] - taken[k])
         late = float(np.nanmedian(apart)) if np.isfinite(apart).any() else np.inf
         if not np.isfinite(late):
-            remarks.append(f"{experiment.path}: no picture of {names[0]} is of one instant with one of {name}")
+            remarks.append(f"{experiment.path}: no pictures of {names[0]} and {name} are of the same instant")
         elif late > LATE_STEPS * usual_s:
-            remarks.append(f"{experiment.path}: the stamps of {names[0]} and {name} differ by {late:.3g} s, usually")
+            remarks.append(f"{experiment.path}: the stamps of {names[0]} and {name} usually differ by {late:.3g} s")
     number = np.arange(taken.shape[1])
     return Timeline(number=number, time_s=np.nanmean(taken, axis=0), rows=rows, remarks=tuple(remarks))
 
@@ -217,7 +217,7 @@ def paired_times(one: Floats, other: Floats, within_s: float) -> Rows:
     nearest = np.where(np.abs(other[high] - one) < np.abs(other[low] - one), high, low)
     apart = np.abs(other[nearest] - one)
     near = apart <= within_s
-    # Two times of `one` may share a nearest neighbour: the nearer one gets it.
+    # Two times of `one` may have the same nearest neighbour: the nearer one gets it.
     best = np.full(len(other), NONE)
     nearest_last = np.flatnonzero(near)[np.argsort(apart[near], kind="stable")[::-1]]
     best[nearest[nearest_last]] = nearest_last

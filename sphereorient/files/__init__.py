@@ -1,1 +1,1 @@
-"""Files: written whole or not at all, HDF5, bounded YAML, provenance, the size of a picture before it is decoded."""
+"""Files: atomic writing, HDF5, bounded YAML, provenance, the size of a picture before it is decoded."""

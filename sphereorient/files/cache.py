@@ -1,4 +1,4 @@
-"""Arrays that depend on their inputs alone and take long to compute, kept in the user's cache folder between runs."""
+"""Arrays that depend only on their inputs and take long to compute, kept in the user's cache folder between runs."""
 
 import hashlib
 import os
@@ -20,16 +20,16 @@ from torch import Tensor
 from sphereorient.errors import OutputError, error_words
 from sphereorient.files.whole_file import put_aside, writing
 
-# Environment variables: where this is set, nothing is kept or read; the folder in place of the user's.
+# Environment variables: one that disables the cache; one that names another folder.
 WITHOUT, FOLDER = "SPHEREORIENT_NO_CACHE", "SPHEREORIENT_CACHE"
-LARGEST_BYTES = 500_000_000  # of all files; the least recently used go first
+LARGEST_BYTES = 500_000_000  # of all files; the least recently used are deleted first
 PACKAGE = Path(__file__).parents[1]
-MAKERS = ("so3.py", "sphere", "search", "pose")  # whose code what is kept depends on
+MAKERS = ("so3.py", "sphere", "search", "pose")  # modules whose code determines the kept arrays
 Arrays = Mapping[str, NDArray[Any]]
 
 
 def cache_folder() -> Path | None:
-    """Return the folder of kept arrays, there or not; None where `WITHOUT` is set."""
+    """Return the folder of kept arrays, existing or not; None if `WITHOUT` is set."""
     if os.environ.get(WITHOUT):
         return None
     given = os.environ.get(FOLDER)
@@ -37,8 +37,8 @@ def cache_folder() -> Path | None:
 
 
 def cached(kind: str, inputs: Iterable[Tensor | str | float | None], make: Callable[[], Arrays]) -> Arrays:
-    """Return what `make` does, from an earlier run with the same inputs, code, versions and processor if there is one.
-    A file that is damaged is made again, with a warning; a folder that cannot be written is warned of once.
+    """Return the result of `make`, from an earlier run with the same inputs, code, versions and processor if there is
+    one. A damaged file is made again, with a warning; a folder that cannot be written causes one warning.
     """
     folder = cache_folder()
     if folder is None:
@@ -64,7 +64,7 @@ def _key(inputs: Iterable[Tensor | str | float | None]) -> str:
 
 @lru_cache(maxsize=1)
 def _code() -> bytes:
-    """Return a word for all that decides on the last bits beside the inputs."""
+    """Return bytes that identify all that determines the last bits beside the inputs."""
     total = hashlib.sha256(f"{torch.__version__} {np.__version__} {torch.backends.cpu.get_cpu_capability()}".encode())
     for name in MAKERS:
         files = sorted((PACKAGE / name).rglob("*.py")) if (PACKAGE / name).is_dir() else [PACKAGE / name]
@@ -74,23 +74,23 @@ def _code() -> bytes:
 
 
 def _read(path: Path) -> Arrays | None:
-    """Return kept arrays, whose check sums are verified; None where there are none."""
+    """Return kept arrays with verified check sums; None if there are none."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         with suppress(OSError):
-            os.utime(path)  # used now
+            os.utime(path)  # mark as used
         return arrays
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        warnings.warn(f"{path} in the cache is damaged ({error_words(error)}) and is made again", stacklevel=2)
+        warnings.warn(f"{path} in the cache is damaged ({error_words(error)}) and is computed again", stacklevel=2)
         return None
 
 
 def _write(path: Path, arrays: Arrays) -> None:
-    """Keep arrays under their final name at once, whoever else writes; delete the oldest files over the limit."""
-    save: Any = np.savez  # whose types take no names
+    """Keep arrays under their final name atomically, despite other writers; delete the oldest files over the limit."""
+    save: Any = np.savez  # its types do not allow names
     try:
         with writing(force=True), put_aside(path) as aside, aside.open("wb") as file:
             save(file, **arrays)
@@ -101,12 +101,12 @@ def _write(path: Path, arrays: Arrays) -> None:
 
 @lru_cache(maxsize=8)
 def warn_once(words: str) -> None:
-    """Warn of each thing once a process."""
+    """Warn of each thing once per process."""
     warnings.warn(words, stacklevel=3)
 
 
 def _trim(folder: Path) -> None:
-    """Delete the least recently used files until the rest is below the limit; another run may delete them too."""
+    """Delete the least recently used files until the rest is below the limit, perhaps while another run deletes too."""
     files = []
     for path in folder.glob("[!.]*.npz"):
         with suppress(OSError):

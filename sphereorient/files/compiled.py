@@ -1,4 +1,4 @@
-"""Compiled code beside its definition in Python: found where it was built for this machine, and of this version."""
+"""Compiled code for definitions in Python, used if built for this machine and version."""
 
 import ctypes
 import os
@@ -10,7 +10,7 @@ import torch
 
 from sphereorient.errors import refusal
 
-WITHOUT = "SPHEREORIENT_NO_COMPILED"  # an environment variable: where it is set, nothing compiled is used
+WITHOUT = "SPHEREORIENT_NO_COMPILED"  # environment variable that disables compiled code
 
 PACKAGE = Path(__file__).parents[1]
 NUMBERS = {"int64_t": ctypes.c_int64, "float": ctypes.c_float, "double": ctypes.c_double}
@@ -31,8 +31,8 @@ def record(source: Path, name: str) -> type[ctypes.Structure]:
 
 @cache
 def compiled(source: Path, record: type[ctypes.Structure]) -> ctypes.CDLL | None:
-    """Return the code of a C source, (without suffix), for this processor; None: not built, or `WITHOUT` is set.
-    `record` is the one that its functions take: code that knows another one is of another version.
+    """Return the code of a C source (without suffix) for this processor; None: not built, or `WITHOUT` is set. `record`
+    is the argument of its functions: code with another record is of another version.
     """
     if os.environ.get(WITHOUT):
         return None
@@ -40,13 +40,13 @@ def compiled(source: Path, record: type[ctypes.Structure]) -> ctypes.CDLL | None
 
 
 def _kinds() -> list[str]:
-    """Return the sets of instructions of this processor that code is built for, the best first."""
+    """Return the instruction sets of this processor for which code is built, best first."""
     return list(dict.fromkeys((torch.backends.cpu.get_cpu_capability().lower(), "default")))
 
 
 def compiled_parts(folder: Path = PACKAGE) -> tuple[dict[str, str], list[str]]:
-    """Return by C source in a folder for which instructions the code in use is built, or that torch does its work; and
-    which code does not load, a line each.
+    """Return the instruction set of the used code for each C source in a folder, or that torch is used; and the code
+    that does not load, a line each.
     """
     used, faults = {}, []
     for path in sorted(folder.rglob("*.c")):
@@ -66,11 +66,11 @@ def _file(source: Path, kind: str) -> Path:
 
 
 def built_for(source: Path, record: type[ctypes.Structure], kind: str) -> ctypes.CDLL | None:
-    """Return the code built for a set of instructions (avx512, avx2, default), as `compiled`."""
+    """Return the code built for an instruction set (avx512, avx2, default), as `compiled`."""
     try:
         code = ctypes.CDLL(str(_file(source, kind)))
         size = code[f"{source.name}_record"]
-    except (OSError, AttributeError):  # not there, or for another machine
+    except (OSError, AttributeError):  # missing, or for another machine
         return None
     size.restype = ctypes.c_int64
     return code if size() == ctypes.sizeof(record) else None

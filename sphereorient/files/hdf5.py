@@ -10,16 +10,16 @@ import numpy as np
 
 from sphereorient.files.whole_file import ROOM, put_aside
 
-# What h5py raises on damaged files, depending on the place of the damage.
+# Exceptions of h5py on damaged files, depending on the damage.
 DAMAGE = (OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError, AttributeError)
-SPHERES = "spheres"  # group of those of several balls
-UNNAMED = ""  # name of an only ball: `sphere:` of an experiment, the arrays of a file itself
+SPHERES = "spheres"  # group with a group for each of several balls
+UNNAMED = ""  # name of a single ball: `sphere:` of an experiment, arrays at the top of a file
 
 
 @contextmanager
 def whole_hdf5(path: Path, do: str = ROOM) -> Iterator[h5py.File]:
-    """Open an HDF5 file that replaces `path` once complete and on the disk; else OutputError with the remedy `do`."""
-    # HDF5 reports a full disk as either error.
+    """Open an HDF5 file that replaces `path` when complete and on the disk; else OutputError with the remedy `do`."""
+    # HDF5 reports a full disk as one of these errors.
     with put_aside(path, do, also=(RuntimeError,)) as aside, GuardedFile(aside) as guarded:
         with h5py.File(guarded, "w", track_order=False) as file:
             file.attrs["made_by"] = "sphereorient"
@@ -29,7 +29,7 @@ def whole_hdf5(path: Path, do: str = ROOM) -> Iterator[h5py.File]:
 
 
 def digest(file: h5py.File) -> str:
-    """Return the SHA-256 of all data sets and attributes of a file but the attribute `sha256`."""
+    """Return the SHA-256 of all data sets and attributes of a file except the attribute `sha256`."""
     total = hashlib.sha256()
 
     def add(name: str, thing: h5py.Group | h5py.Dataset) -> None:
@@ -48,13 +48,13 @@ def ball_group(file: h5py.File, name: str) -> h5py.Group:
 
 
 def ball_groups(file: h5py.File) -> dict[str, h5py.Group]:
-    """Return the groups that `ball_group` made, by name."""
+    """Return the groups made by `ball_group`, by name."""
     return dict(file[SPHERES].items()) if SPHERES in file else {UNNAMED: file}
 
 
 class GuardedFile(io.FileIO):
-    """A file that ignores writes after the first error, and keeps the error for `check`.
-    HDF5 cannot close a file that it cannot write: it fails again at every object and may crash the process.
+    """A file that ignores writes after the first error, and keeps the error for `check`. HDF5 cannot close a file that
+    it cannot write: it fails again at every object and may crash the process.
     """
 
     def __init__(self, path: Path) -> None:
@@ -72,7 +72,7 @@ class GuardedFile(io.FileIO):
         if self._error is None:
             try:
                 done = 0
-                while done < len(view):  # a disk that is nearly full accepts a part
+                while done < len(view):  # a nearly full disk accepts a part
                     done += super().write(view[done:])
             except OSError as error:
                 self._error = error

@@ -1,4 +1,4 @@
-"""The server of pages in the browser: it answers this machine alone, to who knows the random token of the address."""
+"""The server of pages in the browser: local to this machine, and only for addresses with the random token."""
 
 import json
 import secrets
@@ -22,17 +22,17 @@ Answer = Path | bytes | Json | None  # a file of the page, a picture as PNG, val
 
 
 class Page(Protocol):
-    """What lies behind the token; it is asked from several threads. `steps` are the parts of the path."""
+    """Content behind the token, called from several threads. `steps` are the parts of the path."""
 
     def shown(self, steps: Sequence[str]) -> Answer:
-        """Return what lies at a path; None: nothing."""
+        """Return the content at a path; None: nothing."""
 
     def done(self, steps: Sequence[str], asked: Mapping[str, Any]) -> Answer:
-        """Do what is asked for at a path, and return what was done; None: nothing is done there."""
+        """Perform a request at a path, and return its result; None: no such request."""
 
 
 def new_token() -> str:
-    """Return the part of an address that nobody can guess."""
+    """Return the secret part of an address."""
     return secrets.token_urlsafe(16)
 
 
@@ -56,7 +56,7 @@ class PageServer(ThreadingHTTPServer):
         self.address = address(door, token)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Print nothing where who asked has gone away."""
+        """Ignore a client that has disconnected."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)
 
@@ -67,7 +67,7 @@ def address(door: socket.socket, token: str) -> str:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers requests whose path begins with the token and that name this machine."""
+    """Answers requests to this machine whose path begins with the token."""
 
     protocol_version = "HTTP/1.1"
     page: Page
@@ -90,8 +90,8 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(lambda steps: self.page.done(steps, asked if isinstance(asked, dict) else {}))
 
     def _answer(self, make: Callable[[Sequence[str]], Answer]) -> None:
-        """Send what `make` returns of the path behind the token, or its error; nothing is there where it is None, for
-        who does not know the token, and for another host's page.
+        """Send the result of `make` for the path behind the token, or its error; not found if it is None, or if the
+        token or the host is wrong.
         """
         host = self.headers.get("Host", "").rpartition(":")[0]
         first, *steps = self.path.partition("?")[0].lstrip("/").split("/")

@@ -16,24 +16,24 @@ from tifffile import TiffFile, TiffFileError
 from sphereorient.files.whole_file import put_aside
 
 TIFF_SIZE = (256, 257)  # the tags of width and height
-EXIF, FOCAL_35MM, EXIF_SIZE = 0x8769, 0xA405, (0xA002, 0xA003)  # the block of tags, and tags in it
+EXIF, FOCAL_35MM, EXIF_SIZE = 0x8769, 0xA405, (0xA002, 0xA003)  # the block of tags, and its tags
 FILM_MM = 43.27  # diagonal of 35 mm film
 FORMATS = ("PNG", "JPEG", "BMP", "PPM", "TIFF")
 GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
-BOMBS = (Image.DecompressionBombError, Image.DecompressionBombWarning)  # the warning where warnings are errors
+BOMBS = (Image.DecompressionBombError, Image.DecompressionBombWarning)  # the warning, if warnings are errors
 FAULTS = (  # of damaged headers
     *(OSError, ValueError, ArithmeticError, LookupError, MemoryError, SyntaxError, TypeError, AttributeError),
     *(RuntimeError, struct.error, TiffFileError),
 )
-# Thousandths that add up to 1000: R = G = B keeps its value.
+# Thousandths with sum 1000: R = G = B keeps its value.
 RED, GREEN, BLUE = 299, 587, 114
-BOMB_PIXELS = 1 << 40  # reported for pictures that Pillow refuses by their size
+BOMB_PIXELS = 1 << 40  # reported for pictures too large for Pillow
 
-warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # callers compare the size with their own limit
+warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # callers check the size themselves
 
 
 class OnDemand(ABC):
-    """Picture of which the parts that are asked for are decoded; made by `Movie.on_demand`."""
+    """Picture decoded in requested parts."""
 
     shape: tuple[int, int]  # (H, W)
 
@@ -43,16 +43,16 @@ class OnDemand(ABC):
 
     @abstractmethod
     def ask(self, left: int, top: int, right: int, bottom: int) -> None:
-        """Begin to decode a part, right and bottom included, of this picture, and of the next one."""
+        """Start to decode a part, right and bottom included, of this picture and the next one."""
 
     @abstractmethod
     def part(self, left: int, top: int, right: int, bottom: int) -> NDArray[Any]:
-        """Return the picture (H, W), decoded at least where asked for, right and bottom included."""
+        """Return the picture (H, W), decoded at least in this part, right and bottom included."""
 
 
 def claimed_pixels(content: bytes) -> int | None:
-    """Return how many pixels a PNG, JPEG, BMP, PNM or TIFF file claims to have; None for other files.
-    Of sizes that a TIFF file gives twice the largest count: Pillow takes the last, the decoder the first.
+    """Return the number of pixels claimed by a PNG, JPEG, BMP, PNM or TIFF file; None for other files. Of several sizes
+    in a TIFF file the largest counts: Pillow takes the last, the decoder the first.
     """
     try:
         with Image.open(BytesIO(content), formats=FORMATS) as picture:
@@ -70,7 +70,7 @@ def claimed_pixels(content: bytes) -> int | None:
 
 
 def decoded(content: bytes, flags: int) -> NDArray[Any] | None:
-    """Decode a picture file with OpenCV; None where that fails. Check `claimed_pixels` first: memory is allocated."""
+    """Decode a picture file with OpenCV; None if that fails. Check `claimed_pixels` first, as memory is allocated."""
     try:
         return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error:  # an empty file, or a header with impossible numbers
@@ -78,15 +78,14 @@ def decoded(content: bytes, flags: int) -> NDArray[Any] | None:
 
 
 def decoded_grey(content: bytes) -> NDArray[Any] | None:
-    """Return the grey values of a picture file, (H, W), in its own depth; None where decoding fails."""
+    """Return the grey values of a picture file, (H, W), in its own depth; None if decoding fails."""
     picture = decoded(content, GREY)
     return None if picture is None or picture.ndim != 2 else np.asarray(picture)
 
 
 def vertical_field_deg(path: Path) -> float | None:
-    """Return the field of view, top to bottom, of a photograph by its EXIF tags; None without it: no
-    focal length for 35 mm film, or a picture that was cut or scaled since. CIPA DC-008: that length is for equal
-    diagonals, 43.27 mm.
+    """Return the vertical field of view of a photograph from its EXIF tags; None without a focal length for 35 mm film,
+    or for a picture cut or scaled afterwards. CIPA DC-008: that length is for equal diagonals, 43.27 mm.
     """
     try:
         with Image.open(path, formats=FORMATS) as picture:
@@ -107,7 +106,7 @@ def luma(red: NDArray[Any], green: NDArray[Any], blue: NDArray[Any]) -> NDArray[
 
 
 def eight_bits(picture: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return a grey picture of any number type for people to see: its brightest level is white."""
+    """Return a grey picture of any number type for display, with its brightest level as white."""
     white = max(1.0, float(np.percentile(picture[::4, ::4], 99.9)))
     return np.clip(picture * (255.0 / white), 0, 255).astype(np.uint8)
 

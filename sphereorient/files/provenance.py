@@ -16,7 +16,7 @@ from sphereorient.files.whole_file import relative_path
 
 PACKAGES = ("sphereorient", "torch", "kornia", "numpy", "scipy", "opencv-python-headless", "h5py", "av")
 IMPORTED_AS = {"opencv-python-headless": "cv2"}
-OF_EXTRA = {  # what it is for, where its name does not say it
+OF_EXTRA = {  # purpose, unless clear from the name
     "table": "export to parquet and netcdf",
     "nwb": "export to nwb",
     "live": "live --to zmq, serial, lsl or osc",
@@ -29,7 +29,7 @@ OF_EXTRA = {  # what it is for, where its name does not say it
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that results depend on."""
+    """Return the versions of Python and of the packages that affect results."""
     return {"python": platform.python_version()} | {package: _version(package) for package in PACKAGES}
 
 
@@ -43,12 +43,12 @@ def _version(package: str) -> str:
 def _own(name: str) -> list[str]:
     try:
         return metadata("sphereorient").get_all(name) or []
-    except PackageNotFoundError:  # a folder that nothing installed
+    except PackageNotFoundError:  # a folder that is not installed
         return []
 
 
 def _poor(extra: str = "") -> list[Requirement]:
-    """Return which packages are missing or too old that are always required, or by an extra."""
+    """Return the missing or too old packages that are always required, or required by an extra."""
     required = map(Requirement, _own("Requires-Dist"))
     wanted = [one for one in required if (one.marker.evaluate({"extra": extra}) if one.marker else not extra)]
     found = {one: _version(one.name) for one in wanted}
@@ -56,7 +56,7 @@ def _poor(extra: str = "") -> list[Requirement]:
 
 
 def lacking() -> dict[str, str]:
-    """Return the packages of each extra that are missing or too old, and what for, in words."""
+    """Return the missing or too old packages of each extra, and their purpose, as text."""
     poor = {extra: _poor(extra) for extra in _own("Provides-Extra") if extra != "dev"}
     return {
         extra: f"{', '.join(one.name for one in some)} (for {OF_EXTRA.get(extra, extra)})"
@@ -66,7 +66,7 @@ def lacking() -> dict[str, str]:
 
 
 def package_faults() -> list[str]:
-    """Return which packages that are always required are missing, too old, or cannot be imported, a line each."""
+    """Return the always required packages that are missing, too old, or cannot be imported, a line each."""
     faults = []
     for one in _poor():
         do = f"run `pip install '{one.name}{one.specifier}'`"
@@ -74,14 +74,14 @@ def package_faults() -> list[str]:
     for name in PACKAGES:
         try:
             import_module(IMPORTED_AS.get(name, name))
-        except Exception as error:  # what a damaged package raises is its own
+        except Exception as error:  # a damaged package may raise anything
             do = f"run `pip install --force-reinstall {name}`"
             faults.append(refusal(name, expected="a package that can be imported", got=error_words(error), do=do))
     return faults
 
 
 def without_nan(value: Any) -> Any:
-    """Return a value, or nested lists and mappings of such, with None, JSON's null, for NaN and infinity."""
+    """Return a value, also nested lists and mappings, with None, JSON's null, for NaN and infinity."""
     if isinstance(value, dict):
         return {name: without_nan(part) for name, part in value.items()}
     if isinstance(value, list):
@@ -112,13 +112,13 @@ def _digest(files: Sequence[Path]) -> str:
 
 def provenance(inputs: Mapping[Path, Sequence[Path]], folder: Path, command: str) -> dict[str, Any]:
     """Return the track's attribute `provenance`, ready for JSON.
-    `inputs`: each path with its file or the pictures of its sequence in order; named relative to `folder`.
+    `inputs`: each path with its file or the pictures of its sequence in order, named relative to `folder`.
     """
     return {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": command,
         "platform": f"{platform.system()} {platform.machine()}, {sys.implementation.name}",
         "versions": versions(),
-        # By path relative to experiment.yaml: two cameras' movies in two folders often share a name.
+        # By path relative to experiment.yaml, as movies in different folders often have the same name.
         "sha256": {relative_path(path, folder): _digest(files) for path, files in inputs.items()},
     }

@@ -1,6 +1,4 @@
-"""Long computations: independent pieces on all cores (torch, numpy and compiled code compute without Python's lock),
-and how much is done.
-"""
+"""Long computations: independent pieces on all cores (torch, numpy and compiled code release the GIL), and progress."""
 
 import os
 from collections import deque
@@ -14,7 +12,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 Progress = Callable[[str, int, int], None]  # (stage, steps done, all steps); the command line draws a bar
 MOST = 8  # pieces in memory
-_limit = [os.cpu_count() or 1]  # of this process: less in a worker, which shares the machine with others
+_limit = [os.cpu_count() or 1]  # of this process; less in a worker on a shared machine
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -22,7 +20,7 @@ def silent(stage: str, done: int, total: int) -> None:
 
 
 def counted(stage: str, items: Iterable[Item], total: int, progress: Progress) -> Iterator[Item]:
-    """Yield items, and report how many of all are done, before each and at the end."""
+    """Yield items, and report the number done, before each and at the end."""
     for done, item in enumerate(items):
         progress(stage, done, total)
         yield item
@@ -30,7 +28,7 @@ def counted(stage: str, items: Iterable[Item], total: int, progress: Progress) -
 
 
 def cores() -> int:
-    """Return how many threads compute: one a core, or those that `limit_cores` set."""
+    """Return the number of computing threads: one per core, or as set by `limit_cores`."""
     return _limit[0]
 
 

@@ -1,4 +1,4 @@
-"""Files that are read whole, or written whole or not at all, and never over a file that is not this program's."""
+"""Files read whole, or written atomically, never replacing files of other origin."""
 
 import os
 import re
@@ -12,28 +12,28 @@ from pathlib import Path
 
 from sphereorient.errors import OutputError, SphereOrientError, error_words, refusal
 
-TEXT_BYTES = 1_000_000  # of a text file written by hand: a hundred times the usual size
+TEXT_BYTES = 1_000_000  # of a text file written by hand, a hundred times the usual size
 TABLE_BYTES = 5_000_000  # of a table of points: 100,000 of them
-LARGEST_RATIO = 1200  # compression ratio of content of one value; a file that claims more does not hold it
+LARGEST_RATIO = 1200  # compression ratio of constant content; a file that claims more is damaged
 ROOM = "choose a folder that exists, may be written and has room"
 MARK = "made by sphereorient"  # of files that a later run may replace
-HEAD_BYTES = 512  # of a file, where the mark is
-# What texts begin with: a first comment, also of older versions, or keys of JSON. A schema is no mark: users write it.
+HEAD_BYTES = 512  # of a file, which contain the mark
+# Beginnings of texts: a first comment, also of older versions, or keys of JSON. Users write a schema, so it is no mark.
 TEXT_MARK = re.compile(
     rb"(?:#|<!--).*made by sphereorient|# repaired by sphereorient |# experiment: .*\n# method: .*\n# frame_rate_hz: "
     rb'|\{\s*(?:"map": .*,\s*)?(?:"command": ?"sphereorient |"schema": ?"sphereorient-robustness)'
 )
-# The first line of a draft for people to go on with, see `sealed`.
+# The first line of a draft for users, see `sealed`.
 SEAL = re.compile(rb"##? Until it is changed, init may replace it: ([0-9a-f]{8})\n")
-DRAFT = b"by `sphereorient init`"  # in the head of each draft, whatever an editor did to its first line
+DRAFT = b"by `sphereorient init`"  # in the head of each draft, even if its first line was edited
 OLD_PAGE = b'<footer class="faint">sphereorient '
-PNG, PNG_HEAD = b"\x89PNG\r\n\x1a\n", 33  # signature; bytes of it and of the first chunk
+PNG, PNG_HEAD = b"\x89PNG\r\n\x1a\n", 33  # signature; bytes of signature and first chunk
 HDF5 = b"\x89HDF\r\n\x1a\n"
-Identity = tuple[int, int]  # of a file, whatever its name: device and number
+Identity = tuple[int, int]  # of a file, independent of its name: device and number
 
 _inputs: ContextVar[frozenset[Identity]] = ContextVar("inputs", default=frozenset())
 _forced: ContextVar[bool] = ContextVar("forced", default=False)
-_made: dict[Path, tuple[int, int, int]] = {}  # files that this process made, as it left them
+_made: dict[Path, tuple[int, int, int]] = {}  # files made by this process, with their state
 
 
 def read_whole(path: Path, largest: int, expected: str, error: type[SphereOrientError], do: str) -> bytes:
@@ -44,7 +44,7 @@ def read_whole(path: Path, largest: int, expected: str, error: type[SphereOrient
         found = os.stat(path)  # noqa: PTH116 -- follows links as open does, and gives the reason, which Path.is_file does not
         if stat.S_ISREG(found.st_mode) and found.st_size <= largest:
             with path.open("rb") as file:
-                return file.read(found.st_size)  # no more: files under /proc claim 0 bytes, and some never end
+                return file.read(found.st_size)  # not more: files under /proc claim 0 bytes, and some never end
         if stat.S_ISDIR(found.st_mode):
             got, do = "a folder", "name a file in it"
         elif not stat.S_ISREG(found.st_mode):
@@ -61,18 +61,18 @@ def read_whole(path: Path, largest: int, expected: str, error: type[SphereOrient
 def read_text(path: Path, largest: int, expected: str, error: type[SphereOrientError], do: str) -> str:
     """Read a text in UTF-8 with the arguments of `read_whole`; raise `error` also for other bytes."""
     try:
-        return read_whole(path, largest, expected, error, do).decode("utf-8-sig")  # some editors begin with such a mark
+        return read_whole(path, largest, expected, error, do).decode("utf-8-sig")  # some editors write a mark
     except UnicodeDecodeError:
-        got, do = "bytes that are no text", "save it as UTF-8"
+        got, do = "bytes that are not UTF-8", "save it as UTF-8"
         raise error(refusal(str(path), expected=expected, got=got, do=do)) from None
 
 
 @contextmanager
 def writing(inputs: Iterable[Path] = (), *, force: bool = False) -> Iterator[None]:
-    """Within this context `inputs` are not replaced; with `force` all other plain files may be."""
+    """In this context `inputs` are not replaced; with `force` all other plain files may be."""
     found = set()
     for path in inputs:
-        with suppress(OSError, ValueError):  # reading it reports what is wrong
+        with suppress(OSError, ValueError):  # reading reports the fault
             status = path.stat()
             found.add((status.st_dev, status.st_ino))
     known, forced = _inputs.set(_inputs.get() | found), _forced.set(_forced.get() or force)
@@ -84,12 +84,12 @@ def writing(inputs: Iterable[Path] = (), *, force: bool = False) -> Iterator[Non
 
 
 def is_forced() -> bool:
-    """Return whether files without the mark may be replaced here."""
+    """Return whether files without the mark may be replaced."""
     return _forced.get()
 
 
 def check_target(path: Path) -> None:
-    """Raise OutputError if a file may not take the place of `path`: an input, a link, a device, a file of others."""
+    """Raise OutputError if `path` may not be replaced: an input, a link, a device, a file of other origin."""
     do = "choose another name"
     try:
         found = path.lstat()
@@ -113,17 +113,17 @@ def check_target(path: Path) -> None:
 
 
 def _foreign(path: Path) -> str:
-    """Return what a file without the mark is."""
+    """Return a description of a file without the mark."""
     try:
         with path.open("rb") as file:
             drafted = DRAFT in file.read(HEAD_BYTES)
     except OSError:
         drafted = False
-    return "one of `sphereorient init` that was changed since" if drafted else "a file without its mark"
+    return "a changed draft of `sphereorient init`" if drafted else "a file without its mark"
 
 
 def has_mark(path: Path) -> bool:
-    """Return whether a file says that this program made it: HDF5 attribute, PNG text, first comment, tag of a page."""
+    """Return whether a file has this program's mark: HDF5 attribute, PNG text, first comment, tag of a page."""
     try:
         with path.open("rb") as file:
             head = file.read(HEAD_BYTES)
@@ -136,12 +136,12 @@ def has_mark(path: Path) -> bool:
         if head.startswith(HDF5):
             return _hdf5_has_mark(path)
         return MARK.encode() in head if head.startswith(PNG) else TEXT_MARK.match(head) is not None
-    except (OSError, RuntimeError, ValueError, TypeError, LookupError):  # of damaged HDF5
+    except (OSError, RuntimeError, ValueError, TypeError, LookupError):  # for damaged HDF5
         return False
 
 
 def sealed(text: str) -> str:
-    """Return a text with a line on top by which `has_mark` knows whether somebody has changed it."""
+    """Return a text with a first line by which `has_mark` detects changes."""
     return f"## Until it is changed, init may replace it: {zlib.crc32(text.encode()):08x}\n{text}"
 
 
@@ -149,7 +149,7 @@ def _hdf5_has_mark(path: Path) -> bool:
     import h5py
 
     with h5py.File(path, "r") as file:
-        found = [file.attrs.get(name) for name in ("made_by", "schema")]  # the second of older versions
+        found = [file.attrs.get(name) for name in ("made_by", "schema")]  # the second is of older versions
     return any(isinstance(one, str) and one.startswith("sphereorient") for one in found)
 
 
@@ -167,26 +167,26 @@ def _state(found: os.stat_result) -> tuple[int, int, int]:
 
 
 def unfinished(path: Path) -> Path:
-    """Return a name beside `path`, with its suffix, that nobody can guess, for what is not finished."""
+    """Return an unguessable name beside `path`, with its suffix, for an unfinished file."""
     return path.with_name(f".{path.stem[:40]}.{secrets.token_hex(8)}.partial{path.suffix}")
 
 
 @contextmanager
 def put_aside(path: Path, do: str = ROOM, also: tuple[type[Exception], ...] = ()) -> Iterator[Path]:
-    """Give an empty file with the same suffix that replaces `path` at the end (`check_target`), or goes after an error.
-    OutputError with the remedy `do` for OSError or an error of `also`; the old file is kept.
+    """Yield the path of an empty file with the same suffix that replaces `path` at the end (`check_target`), or is
+    deleted after an error. OutputError with the remedy `do` for OSError or an error of `also`; the old file is kept.
     """
     failures: tuple[type[Exception], ...] = (OSError, *also)
     check_target(path)
     aside = unfinished(path)
     make_folder(path.parent, str(path))
     try:
-        aside.touch(exist_ok=False)  # exclusively: a link planted here is not followed
+        aside.touch(exist_ok=False)  # exclusive, so that a link is not followed
         _made[aside.absolute()] = _state(aside.stat())
         yield aside
         if path.suffix.lower() == ".png":
             _add_mark(aside)
-        check_target(path)  # again: hours may have passed
+        check_target(path)  # again, as hours may have passed
         aside.replace(path)
         _made[path.absolute()] = _state(path.stat())
     except failures as error:
@@ -206,7 +206,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def make_folder(path: Path, name: str) -> None:
-    """Make a folder and its parents where there is none; raise OutputError, with `name`, if that fails."""
+    """Make a folder and its parents if missing; raise OutputError, with `name`, if that fails."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -215,12 +215,12 @@ def make_folder(path: Path, name: str) -> None:
 
 
 def relative_path(path: Path | str, folder: Path) -> str:
-    """Return a path as a file in `folder` names it, with / on every system."""
+    """Return a path relative to `folder`, with / on every system."""
     return Path(os.path.relpath(path, folder)).as_posix()
 
 
 def check_folder(path: Path, name: str) -> None:
-    """Raise OutputError, with `name`, if the folder of a file to write cannot be made or may not be written in."""
+    """Raise OutputError, with `name`, if the folder of a file to write cannot be made or is not writable."""
     folder = next((one for one in path.absolute().parents if one.exists()), Path("/"))
     if not (folder.is_dir() and os.access(folder, os.W_OK)):
         got = f"{folder}, which may not be written" if folder.is_dir() else f"{folder}, a file"

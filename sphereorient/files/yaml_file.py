@@ -1,5 +1,5 @@
-"""Reading and writing bounded YAML files of plain values; every fault is one line with file and key. Drafts for people
-to go on with: each key explained, those that nobody could measure left open.
+"""Reading and writing bounded YAML files of plain values; every fault is one line with file and key. Drafts for users:
+each key with a comment, unknown ones left open.
 """
 
 import difflib
@@ -21,17 +21,17 @@ from sphereorient.files.whole_file import MARK, TEXT_BYTES, read_text, sealed, w
 
 Model = TypeVar("Model", bound=BaseModel)
 SHOWN = 20  # known names in a message
-MAX_DEPTH = 30  # our files have five levels
-MAX_NODES = 20_000  # an alias counts as often as it is used; a covariance of 100 parameters has 10,000
+MAX_DEPTH = 30  # the files have five levels
+MAX_NODES = 20_000  # aliases count at each use; a covariance of 100 parameters has 10,000
 MAX_TEXT = 4096  # characters of one value, such as a path
-MAX_NUMBER = 64  # characters of a number: longer ones take long to convert, and fill messages
-MAX_KEY = 100  # characters of a key: it appears in messages
+MAX_NUMBER = 64  # characters of a number; longer ones convert slowly and fill messages
+MAX_KEY = 100  # characters of a key, which appears in messages
 NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
-# Control characters, lone surrogates and line separators would break messages of one line.
+# Control characters, lone surrogates and line separators break messages of one line.
 UNSEEN = frozenset({"Cc", "Cs", "Zl", "Zp"})
-FAULTS = (yaml.YAMLError, ValueError, OverflowError)  # a date that does not exist is a ValueError, 1:1:...:1.5 the last
+FAULTS = (yaml.YAMLError, ValueError, OverflowError)  # an impossible date is a ValueError, 1:1:...:1.5 an OverflowError
 WIDTH = 120  # characters of a line
-SLIP_LINES = 2  # before the line at which a parser stops: there the slip may be
+SLIP_LINES = 2  # searched for a slip before the line at which the parser stops
 SLIPS = {  # in a line of YAML without its comment
     "a tab, where spaces belong,": re.compile(r"^\s*\t|:\s*\t"),
     "a quote that is not closed": re.compile(r"""[:\[{,-]\s*(["'])(?:(?!\1).)*$"""),
@@ -43,7 +43,7 @@ SLIPS = {  # in a line of YAML without its comment
 def read_document(
     path: Path, schema: str, error: type[SphereOrientError], do: str = "correct the path"
 ) -> dict[str, Any]:
-    """Read a YAML mapping of this `schema`, without that key; raise `error` for others, with `do` where none is."""
+    """Read a YAML mapping of this `schema`, without that key; raise `error` for others; `do`: for a missing file."""
     document = read_yaml(path, error, do)
     if not isinstance(document, dict):
         got = "an empty file" if document is None else short(document)
@@ -68,7 +68,7 @@ def validated(
     model: type[Model], data: Any, where: str, error: type[SphereOrientError], also: Sequence[str] = ()
 ) -> Model:
     """Validate YAML data against a model that forbids extra keys; raise `error` with the first fault and `where`.
-    All missing keys are named at once; `also`: those that the caller misses.
+    All missing keys are named together with `also`, missing keys found by the caller.
     """
     try:
         return model.model_validate(data)
@@ -86,8 +86,8 @@ def refuse_unknown(key: object, known: Iterable[str], where: str) -> str:
 
 
 def write_document(path: Path, schema: str, document: Mapping[str, Any], comment: str = "") -> None:
-    """Write YAML with its schema as first key, the mark and `comment` above, replacing an old file at once.
-    Small numbers are written as 1.0e-05: YAML 1.1 reads 1e-05 as text.
+    """Write YAML with its schema as first key, the mark and `comment` above, replacing an old file atomically.
+    Small numbers are written as 1.0e-05, since YAML 1.1 reads 1e-05 as text.
     """
     comment = comment if MARK in comment.partition("\n")[0] else f"{MARK}\n{comment}"
     lines = "".join(f"# {line}\n" for line in comment.splitlines())
@@ -110,7 +110,7 @@ def flow(value: Any) -> str:
 
 
 def parse_override(text: str) -> tuple[str, Any]:
-    """Return the key and the value, YAML, of `key=value`, the text of an option --set; SettingsError for another."""
+    """Return key and value (YAML) of `key=value`, the text of an option --set; SettingsError for other texts."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise SettingsError(refusal(f"--set {text}", expected="key=value", got=short(text), do="give both"))
@@ -122,7 +122,7 @@ def parse_override(text: str) -> tuple[str, Any]:
 
 
 def yaml_words(fault: Exception) -> str:
-    """Word the fault of a YAML text in one short line: the likely slip, else what the parser says."""
+    """Return the fault of a YAML text in one short line: the likely slip, else the parser's message."""
     mark = getattr(fault, "problem_mark", None)
     if isinstance(fault, ScannerError | ParserError) and (slip := _slip(fault)):
         return slip
@@ -132,7 +132,7 @@ def yaml_words(fault: Exception) -> str:
 
 
 def _slip(fault: ScannerError | ParserError) -> str | None:
-    """Return the likely slip behind a fault of a YAML text, with its line; None where none is known."""
+    """Return the likely slip behind a fault of a YAML text, with its line; None if unknown."""
     at, begun = fault.problem_mark, fault.context_mark
     if at is None or not at.buffer:
         return None
@@ -142,25 +142,24 @@ def _slip(fault: ScannerError | ParserError) -> str | None:
         if slip:
             return f"{slip} in line {number + 1}"
     if begun is not None and "flow" in (fault.context or ""):
-        return f"a bracket that is not closed, or a comma that is missing, in what begins in line {begun.line + 1}"
+        return f"a bracket that is not closed, or a comma that is missing, in the part from line {begun.line + 1}"
     if "block" in (fault.context or "") or "mapping values" in (fault.problem or ""):
-        return f"an indent that fits no line above in line {at.line + 1}"
+        return f"an indent unlike any line above in line {at.line + 1}"
     return None
 
 
 def parse_yaml(text: str, most_nodes: int = MAX_NODES) -> Any:
-    """Parse one bounded YAML document of plain values; aliases are allowed, tags and repeated keys are not.
-    Raises yaml.YAMLError: not YAML, or with tags, repeated keys, keys that are not names, or beyond a bound above;
-    ValueError: an impossible value, such as a date that does not exist; OverflowError: a number to the base 60 that is
-    too large.
+    """Parse one bounded YAML document of plain values; aliases are allowed, tags and repeated keys are not. Raises
+    yaml.YAMLError: not YAML, or with tags, repeated keys, keys that are not names, or beyond a bound above; ValueError:
+    an impossible value, such as an impossible date; OverflowError: too large a number to the base 60.
     """
     return _BoundedLoader(text, most_nodes).get_single_data()
 
 
 def with_value(text: str, place: Sequence[str | int], value: Any) -> str | None:
-    """Return a YAML text with the value at `place`, keys and numbers of list entries, written in one line there; all
-    else, comments included, stays. An absent last key is added, in the place of one that is commented out. None where
-    that could lose something: an old value in several lines, or a form that is not understood.
+    """Return a YAML text with the value at `place` (keys and numbers of list entries) replaced in one line; the rest
+    stays, with comments. An absent last key is added, in the place of a commented-out one. None if something could be
+    lost: an old value in several lines, or an unknown form.
     """
     *above, key = place
     try:
@@ -190,7 +189,7 @@ def _node_at(node: yaml.Node | None, place: Iterable[str | int]) -> yaml.Node:
 
 
 def _spliced(text: str, node: yaml.Node, key: str, line: str) -> str | None:
-    """Return a text whose mapping `node` has a key with this line as value; None where the old value has more lines."""
+    """Return a text whose mapping `node` has a key with this line as value; None if the old value has more lines."""
     if not isinstance(node, yaml.MappingNode) or not node.value:
         return None
     for name, old in node.value:
@@ -205,7 +204,7 @@ def _spliced(text: str, node: yaml.Node, key: str, line: str) -> str | None:
     commented = re.compile(rf"^{indent}# ?{re.escape(key)}:.*$", re.MULTILINE)
     if not indent and commented.search(text):
         return commented.sub(lambda _: f"{key}: {line}", text, count=1)
-    while isinstance(last, yaml.CollectionNode) and not last.flow_style:  # the end of a block is vague
+    while isinstance(last, yaml.CollectionNode) and not last.flow_style:  # the end of a block is not exact
         last = last.value[-1] if isinstance(last, yaml.SequenceNode) else last.value[-1][1]
     end = last.end_mark.index
     end += len(text[end:].partition("\n")[0].rstrip("\r"))
@@ -226,7 +225,7 @@ class _BoundedLoader(yaml.SafeLoader):
         self._most = most_nodes
         self._depth = 0
         self._nodes = 0
-        self._size: dict[yaml.Node, int] = {}  # nodes of each finished node, itself included
+        self._size: dict[yaml.Node, int] = {}  # number of nodes in each finished node, with itself
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         event, before = self._next(), self._nodes
@@ -272,10 +271,10 @@ class _BoundedLoader(yaml.SafeLoader):
 
 
 def _worded(fault: ValidationError, model: type[BaseModel], where: str, also: Sequence[str]) -> str:
-    # An unknown key first: it is often a missing one, mistyped.
+    # An unknown key first, often a mistyped missing one.
     first = min(fault.errors(include_url=False), key=lambda error: error["type"] != "extra_forbidden")
     place, kind, message = first["loc"], first["type"], first["msg"]
-    if isinstance(cause := first.get("ctx", {}).get("error"), SphereOrientError):  # worded already
+    if isinstance(cause := first.get("ctx", {}).get("error"), SphereOrientError):  # already worded
         return f"{where}, {cause}"
     name = ", ".join([where, ".".join(map(str, place))]) if place else where
     if kind == "extra_forbidden":
@@ -291,9 +290,9 @@ def _worded(fault: ValidationError, model: type[BaseModel], where: str, also: Se
 
 
 def _known_keys(model: type[BaseModel], place: Iterable[int | str]) -> list[str]:
-    """Return the keys of a model's part at `place`, the keys that lead there."""
+    """Return the keys of the part of a model at the path `place`."""
     for step in place:
-        if str(step) in model.model_fields:  # others are names or numbers from the file, such as a camera's
+        if str(step) in model.model_fields:  # others are names or numbers in the file, such as of a camera
             annotation = model.model_fields[str(step)].annotation
             kinds = (annotation, *get_args(annotation))
             model = next(kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel))
@@ -305,14 +304,14 @@ class DraftKey:
     """A key of a draft."""
 
     name: str  # with its parent: sphere.diameter
-    value: Any = ...  # ...: not known
-    comment: str  # unit, meaning, what was measured
-    example: Any = None  # of a key that is not known
-    asked: bool = False  # whether the file is of no use without it
+    value: Any = ...  # ...: unknown
+    comment: str  # unit, meaning, measured value
+    example: Any = None  # for an unknown value
+    asked: bool = False  # whether the file needs it
 
 
 def given(keys: Sequence[DraftKey], changes: Iterable[str]) -> list[DraftKey]:
-    """Return keys with values `name=value`, YAML, put in; SettingsError for an unknown name or no YAML."""
+    """Return keys with values `name=value`, YAML, filled in; SettingsError for an unknown name or invalid YAML."""
     known = {key.name: key for key in keys}
     for text in changes:
         name, found = parse_override(text)
@@ -322,13 +321,13 @@ def given(keys: Sequence[DraftKey], changes: Iterable[str]) -> list[DraftKey]:
         example = key.example if key.value in (..., None) else key.value
         if found is not None and not _alike(found, example):
             expected = f"a value like {flow(example)[:60]}"
-            raise SettingsError(refusal(f"--set {name}", expected=expected, got=short(found), do="write such a one"))
+            raise SettingsError(refusal(f"--set {name}", expected=expected, got=short(found), do="write such a value"))
         known[key.name] = replace(key, value=found)
     return list(known.values())
 
 
 def _alike(value: Any, example: Any) -> bool:
-    """Return whether a value is of an example's kind: a number, words, yes or no, a list or a mapping of such."""
+    """Return whether a value is of an example's kind: a number, text, boolean, or a list or mapping of these."""
     if isinstance(example, Mapping):
         some = next(iter(example.values()), None)
         return isinstance(value, Mapping) and all(_alike(part, example.get(name, some)) for name, part in value.items())
@@ -340,12 +339,12 @@ def _alike(value: Any, example: Any) -> bool:
 
 
 def open_keys(keys: Iterable[DraftKey]) -> list[DraftKey]:
-    """Return the keys that are asked for and not known."""
+    """Return the needed keys of unknown value."""
     return [key for key in keys if key.asked and key.value is ...]
 
 
 def draft_yaml(schema: str, keys: Sequence[DraftKey], head: str = "") -> str:
-    """Return the text of a file: keys not known are comments, with an example; those asked for say so. Without its "#"
+    """Return the text of a file: unknown keys are comments, with an example; needed ones are marked. Without its "#"
     each such line is a key in its place; lines that only explain begin with "##".
     """
     lines = [*(f"## {line}" for line in head.splitlines()), f"schema: {schema}", *_block(keys, ""), ""]
@@ -353,7 +352,7 @@ def draft_yaml(schema: str, keys: Sequence[DraftKey], head: str = "") -> str:
 
 
 def _block(keys: Sequence[DraftKey], indent: str) -> list[str]:
-    """Return the lines of keys; a parent of which nothing is known takes one line."""
+    """Return the lines of keys; a parent without known keys takes one line."""
     groups: dict[str, list[DraftKey]] = {}
     for key in keys:
         parent, _, name = key.name.partition(".")
@@ -373,7 +372,7 @@ def _line(key: DraftKey, name: str, indent: str) -> list[str]:
     known = key.value is not ...
     values = key.value if known else key.example
     comment = f"# {'' if known or not key.asked else 'WRITE THIS: '}{key.comment}" if key.comment else ""
-    mark = indent if known else f"{indent}#"  # without the "#" the key stands where it belongs
+    mark = indent if known else f"{indent}#"  # without the "#" the key is in its place
     if isinstance(values, list) and values and isinstance(values[0], Mapping):
         return [f"{mark}{name}:  {comment}", *(f"{mark}  - {flow(value)}" for value in values)]
     text = f"{mark}{name}: {flow(values)}"

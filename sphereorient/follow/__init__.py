@@ -1,4 +1,4 @@
-"""Along time: appearance, search without history, chunks of frames, one tracker for all balls."""
+"""Tracking along time: appearance, search without history, chunks of frames, one tracker for all balls."""
 
 from sphereorient.follow.appearance import Appearance
 from sphereorient.follow.tracker import Tracker

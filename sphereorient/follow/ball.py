@@ -1,4 +1,4 @@
-"""Poses of one ball in single frames: from what the frames before say, or by a search."""
+"""Poses of one ball in single frames: predicted from the frames before, or by a search."""
 
 from collections.abc import Mapping, Sequence
 from copy import copy
@@ -28,39 +28,39 @@ from sphereorient.pose.poses import FittedPoses, Poses, PoseStart, no_pose, pose
 
 Floats = NDArray[np.float64]
 
-ARRIVED_RAD = 0.02  # a fit whose last step is longer has not arrived
-MORE_THAN_USUAL = 0.5  # of what a doubtful fit leaves: it may have stopped early, and is done once more
-CONTRADICTS_USUAL = 4.0  # times the usual angle between the cameras' own rotations, and
-CONTRADICTS_SIGMAS = 2.8  # of these rotations: then the pictures are of different instants
-LEAST_VISIBLE = 0.08  # share of a disk; a camera to which other spheres leave less is not used
-HIDDEN_LESS = 0.5  # by which the least score falls with the share of a disk that others hide
-SILENT = 0.4  # share of a disk; of less the score may be 0, that of unknown paint
-AGREES_AGAIN = 0.5  # of these limits: cameras that contradicted each other must agree better than others
-# What a camera alone gives, beside rotation and move from the pose.
+ARRIVED_RAD = 0.02  # a fit whose last step is longer has not converged
+MORE_THAN_USUAL = 0.5  # excess of unexplained variance of a doubtful fit, which is repeated
+CONTRADICTS_USUAL = 4.0  # times the usual angle between rotations by each camera alone, and
+CONTRADICTS_SIGMAS = 2.8  # of these rotations: above both, the pictures are of different instants
+LEAST_VISIBLE = 0.08  # least share of a disk not hidden by other spheres for a camera to be used
+HIDDEN_LESS = 0.5  # decrease of the least score with the share of a disk that others hide
+SILENT = 0.4  # share of a disk; for less the score may be 0, as for unknown paint
+AGREES_AGAIN = 0.5  # of these limits, for cameras that contradicted each other before
+# Results of a camera alone, besides rotation and displacement from the pose.
 OWN = ("own_covariance", "own_sigma_mm", "limb_coverage", "excess", "score")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Predicted:
-    """B predictions of a ball, and the pictures of C cameras that may show it."""
+    """B predictions of a ball, with the pictures of C cameras."""
 
     frames: Sequence[Sequence[Frame]]  # B of C
     pictures: Sequence[Sequence[Shown]]
     position_lab_mm: Tensor  # (B, 3)
     R_lab_body: Tensor  # (B, 3, 3)
     precision: Tensor  # (B, 3, 3), mm^-2, of the position
-    start: partial[PoseStart]  # of a fit, but for pose and use
+    start: partial[PoseStart]  # of a fit, without pose and use
     known: Tensor  # (B, C) bool, cameras that saw the ball before
     readable: Tensor  # (B, C) bool
-    sees: Tensor  # (B, C) bool, cameras to which other balls leave enough of it
+    sees: Tensor  # (B, C) bool, cameras in which other balls do not hide too much of it
     contradicted: Tensor  # (B,) bool, a camera contradicted the others before
-    beyond: Tensor  # (B,) bool, disks that have more pixels: see `BallTracker._wider`
+    beyond: Tensor  # (B,) bool, disks larger than the stencil, see `BallTracker._wider`
     disks_px: DisksPx
-    visible: Tensor | None  # (B, C), share of the disks that other balls leave; None: all
+    visible: Tensor | None  # (B, C), share of the disks not hidden by other balls; None: all
 
 
 class _Found(NamedTuple):
-    """Fits of B predictions, cameras in use (B, C) bool, whether these support it (B,), and cameras (B, C) with a
+    """Fits of B predictions, cameras in use (B, C) bool, whether these support the fit (B,), and cameras (B, C) with a
     picture that can show the ball.
     """
 
@@ -71,13 +71,13 @@ class _Found(NamedTuple):
 
     @property
     def unused(self) -> Tensor:
-        """Cameras (B, C) with such a picture that are not in use."""
+        """Usable cameras (B, C) that are not in use."""
         return self.usable & ~self.use
 
 
 class BallTracker:
-    """Measures one ball in frames of several chunks at a time; see `Tracker`. `centre` is that of a ball that only
-    rotates; None: each frame has its own position.
+    """Measures one ball in frames of several chunks at a time; see `Tracker`. `centre`: of a ball that only rotates;
+    None: each frame has its own position.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class BallTracker:
         self._of_size: dict[int, BallTracker] = {}
 
     def turns(self, chunks: Sequence[Chunk], found: Sequence[Poses]) -> Floats:
-        """Return the turn of each chunk since the pose that it saw last, (n, 3), rad, lab; 0 without one."""
+        """Return the rotation of each chunk's ball since its last pose, (n, 3), rad, lab; 0 if there is none."""
         turns = np.tile(np.eye(3), (self._lanes(len(chunks)), 1, 1))
         for row, (chunk, poses) in enumerate(zip(chunks, found, strict=True)):
             if chunk.past and supported(poses):
@@ -107,7 +107,7 @@ class BallTracker:
         return so3.log(torch.from_numpy(turns))[: len(chunks)].numpy()
 
     def _disks_px(self, position_lab_mm: Tensor) -> DisksPx:
-        """Return the fitter's disks of positions (n, 3); those of a fixed centre do not change."""
+        """Return the disks of positions (n, 3); those of a fixed centre are computed once."""
         if self.centre is None:
             return self.fitter.disks_px(position_lab_mm)
         middles, radius, _ = self._disks_of_centre
@@ -119,11 +119,11 @@ class BallTracker:
         return self.fitter.disks_px(self.centre.position_lab_mm[None])
 
     def _lanes(self, count: int) -> int:
-        """Return the size of batches: always the same, since the last bits depend on it."""
+        """Return the fixed size of batches: the last bits depend on it."""
         return max(count, self.settings.chunks)
 
     def ahead(self, chunk: Chunk, frame: int) -> Expected | None:
-        """Return what the frames before say of a frame of a chunk."""
+        """Return the prediction of a frame of a chunk."""
         pose = chunk.expected(frame, self.fitter.radius_mm, self.exposure_s)
         if pose is None or self.centre is None:
             return pose
@@ -131,7 +131,7 @@ class BallTracker:
         return replace(pose, position_lab_mm=place, place_spread=spread)
 
     def follow(self, expected: Sequence[Expected], frames: Sequence[Sequence[Frame]]) -> list[Poses | None]:
-        """Fit predicted poses in one batch of fixed size; None where the pictures do not support one."""
+        """Fit predicted poses in one batch of fixed size; None if the pictures do not support a pose."""
         if not expected:
             return []
         asked, missing = len(expected), self._lanes(len(expected)) - len(expected)
@@ -140,7 +140,7 @@ class BallTracker:
         first = self._first_fit(there)
         found, alone = self._with_fewer(there, first)
         found, doubtful = self._with_more(there, found)
-        # Another camera is judged only where this frame needs it: results must not depend on the batch.
+        # Test another camera only if this frame needs it: results must not depend on the batch.
         others = (found.good & (~first.good | there.contradicted | doubtful))[:, None] & found.unused
         fit = found.fit
         for k in range(others.shape[1] if bool(others.any()) else 0):
@@ -162,7 +162,7 @@ class BallTracker:
         return poses
 
     def followed(self, expected: Expected, frames: Sequence[Frame]) -> Poses | None:
-        """Fit the predicted pose of one frame, as `follow`; at once None where no picture shows anything like it."""
+        """Fit the predicted pose of one frame, as `follow`; None at once if no picture shows anything similar."""
         pictures = [[shot.shown for shot in frames]]
         contradicted = Reason.CONTRADICTS in expected.reason
         if not contradicted and bool(expected.use.all()) and all(shot.readable for shot in frames):
@@ -181,7 +181,7 @@ class BallTracker:
 
     def spotted(self, frames: Sequence[Frame]) -> Poses:
         """Find the pose of a frame without history by the ball's blob, in a quarter of the time of `searched`, which
-        finds it also where others are beside the ball or before it.
+        also finds a ball with others beside or in front of it.
         """
         there = self.search.glanced(frames, None if self.centre is None else self.centre.position_lab_mm)
         if not bool(there.use.any()) or not len(there):
@@ -207,8 +207,8 @@ class BallTracker:
         use: Tensor,
         among: Neighbours | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return where fits begin: position (B, 3), mm, rotation (B, 3, 3), precision of the position (B, 3, 3), mm^-2,
-        and motion while the shutter is open (B, 6); a rough prediction is brought near first.
+        """Return the start of fits: position (B, 3), mm, rotation (B, 3, 3), precision of the position (B, 3, 3),
+        mm^-2, and motion during the exposure (B, 6). Rough predictions are first improved by coarse fits.
         """
         X, R_before, turn, spread, moved = (
             torch.from_numpy(np.stack([getattr(one, name) for one in expected]))
@@ -223,7 +223,7 @@ class BallTracker:
         return X, R, precision, moved
 
     def _predicted(self, expected: Sequence[Expected], frames: Sequence[Sequence[Frame]]) -> _Predicted:
-        """Return where the ball is expected, and the pictures that may show it."""
+        """Return the predictions, and the pictures that may show the ball."""
         known, among = torch.stack([one.use for one in expected]), joined_neighbours([one.among for one in expected])
         pictures = [[shot.shown for shot in row] for row in frames]
         readable = torch.tensor([[shot.readable for shot in row] for row in frames])
@@ -255,7 +255,7 @@ class BallTracker:
         use = there.known & usable
         fit = self._fitted(there, X, R, use, disks_px)
         if visible is None and bool((poor := self._poor(fit, use)).any()):
-            # A sharp picture holds the fit where it began: once more, from coarse to fine.
+            # With sharp pictures the fit may stay at its start: repeat it from coarse to fine.
             which = poor.nonzero()[:, 0]
             some, pictures = there.start(X, R, use).of(which), [there.pictures[k] for k in which.tolist()]
             at = some.position_lab_mm, some.R_lab_body
@@ -265,7 +265,7 @@ class BallTracker:
             fit = fit.with_rows(which[better].tolist(), again.of(better))
         good = self._supported(fit, use, visible)
         if not bool(good.all()):
-            # Whether a picture is dark or white takes all of it: only where it is not as expected.
+            # Testing for dark or white pictures decodes them whole: only if a picture is not as expected.
             rows = zip(usable, good.tolist(), there.frames, strict=True)
             usable = there.sees & torch.stack([all_ if ok else _usable(row) for all_, ok, row in rows])
             changed = (use != (there.known & usable)).any(1)
@@ -276,8 +276,8 @@ class BallTracker:
         return _Found(fit, use, good, usable)
 
     def _with_fewer(self, there: _Predicted, found: _Found) -> tuple[_Found, dict[int, FittedPoses]]:
-        """Leave out as few cameras as possible where one picture without the ball spoils the joint fit; of subsets of
-        one size, which disagree, the one nearer to the prediction counts. Return also the fits of single cameras.
+        """Leave out as few cameras as possible if a picture without the ball spoils the joint fit; among subsets of one
+        size, the fit nearest the prediction is taken. Return also the fits of single cameras.
         """
         fit, use, good, usable = found
         X, R = there.position_lab_mm, there.R_lab_body
@@ -303,8 +303,8 @@ class BallTracker:
         return _Found(fit, use, good, usable), alone
 
     def _with_more(self, there: _Predicted, found: _Found) -> tuple[_Found, Tensor]:
-        """Test cameras that did not see the ball before at the joint pose: they may see it again. Return also for which
-        frames, (B,) bool, they contradict the others.
+        """Test cameras that did not see the ball before at the joint pose. Return also for which frames, (B,) bool,
+        they contradict the others.
         """
         fit, use, good, usable = found
         if not bool(found.unused.any()):
@@ -317,7 +317,7 @@ class BallTracker:
         fit, use = both.where(back, fit), torch.where(back[:, None], usable, use)
         several = good & ~back & ((usable & ~use).sum(1) > 1)
         for k in range(use.shape[1] if bool(several.any()) else 0):
-            # Of several such cameras some may see it.
+            # Some of several such cameras may see it.
             rows = several & (usable & ~use)[:, k]
             wider = torch.where(rows[:, None], use | _only(usable, [k]), use)
             both = self._fitted(there, fit.position_lab_mm, fit.R_lab_body, wider)
@@ -326,7 +326,7 @@ class BallTracker:
         return _Found(fit, use, good, usable), unused & contradicts
 
     def _wider(self, radius_px: float) -> "BallTracker":
-        """Return a tracker of single frames for a disk that is larger than those the movie was studied on."""
+        """Return a tracker of single frames for a disk larger than those of the appearance."""
         steps = size_steps(radius_px / self.fitter.widest_px)
         if steps not in self._of_size:
             wider = self._of_size[steps] = copy(self)
@@ -335,7 +335,7 @@ class BallTracker:
         return self._of_size[steps]
 
     def _poor(self, fit: FittedPoses, use: Tensor) -> Tensor:
-        """Return which poses (B,) leave much more of a picture in use than right ones usually do."""
+        """Return which poses (B,) leave much more of a picture in use unexplained than right poses usually do."""
         return ((1.0 - fit.score > MORE_THAN_USUAL * (1.0 - self.usual_score)) & use).any(1)
 
     def _approached(
@@ -347,7 +347,7 @@ class BallTracker:
         rough: Tensor,
         among: Neighbours | None,
     ) -> tuple[Tensor, Tensor]:
-        """Bring those poses that are rough, (B,) bool, into the basin of the finest level, through coarser ones."""
+        """Fit rough poses, (B,) bool, at coarser levels, to bring them into the basin of the finest level."""
         X, R = poses
         for level, every, iterations in ((self.fitter.optics.coarse, 1, 4), (self.fitter.optics.middle, 3, 3)):
             pixels = self.fitter.pixels(pictures, X, level, self.fitter.widest_px, neighbours=among)
@@ -364,12 +364,12 @@ class BallTracker:
         return self.fitter.settled(there.pictures, begin, disks_px)
 
     def _from(self, position_lab_mm: Tensor) -> Tensor:
-        """Return the start of a further fit, (B, 3): where the last one ended, or the fixed centre."""
+        """Return the start (B, 3) of a further fit: the last result, or the fixed centre."""
         return position_lab_mm if self.centre is None else self.centre.position_lab_mm.expand_as(position_lab_mm)
 
     def _supported(self, fit: FittedPoses, use: Tensor, visible: Tensor | None = None) -> Tensor:
-        """Return which poses have converged and explain all pictures in use well, (B,) bool. Of disks of which others
-        leave a share `visible` (B, C), less is asked, and nothing where it is too little for a score.
+        """Return which poses have converged and explain all pictures in use well, (B,) bool. The limit is lower for
+        disks with a visible share `visible` (B, C) below 1, and absent if that is too little for a score.
         """
         seen = use.numpy()
         explained = (fit.score.numpy() >= self.score_min) | ~seen
@@ -378,13 +378,13 @@ class BallTracker:
             explained |= (score >= self.score_min - HIDDEN_LESS * (1.0 - left)) & (left < 1.0)
             explained |= (score == 0) & (left < SILENT)
         arrived = np.linalg.norm(fit.step.numpy()[:, :3], axis=-1) < ARRIVED_RAD
-        if visible is not None:  # of little paint the pose may not be known at all
+        if visible is not None:  # little visible paint may not determine the pose at all
             arrived &= ((score > 0) & seen).any(1) & np.isfinite(fit.covariance.numpy()).all((1, 2))
         good = torch.from_numpy(seen.any(1) & explained.all(1) & arrived)
         return good if use.shape[1] == 1 else good & ~self.contradictory(fit, use)
 
     def contradictory(self, said: FittedPoses | Poses, use: Tensor, limit: Tensor | float = 1.0) -> Tensor:
-        """Return for which poses two cameras disagree, (B,) bool: their pictures are not of one instant."""
+        """Return for which poses two cameras disagree, (B,) bool: their pictures are of different instants."""
         wrong = torch.zeros(len(use), dtype=torch.bool)
         for k, m in combinations(range(use.shape[1]), 2):
             apart = said.own_turn[:, k] - said.own_turn[:, m]
@@ -397,11 +397,11 @@ class BallTracker:
     def start(
         self, frames: Sequence[Frame], names: Sequence[str], known: Mapping[str, Tensor], past: Mapping[str, Ahead]
     ) -> dict[str, Poses]:
-        """Find a ball that is alone in the scene, as `SceneStart` finds several."""
+        """Find a ball alone in the scene; `SceneStart` finds several."""
         return dict.fromkeys(names, self.searched(frames))
 
     def searched(self, frames: Sequence[Frame]) -> Poses:
-        """Find the poses of a frame without history, with those cameras whose pictures support them."""
+        """Find the poses of a frame without history, in the cameras whose pictures support them."""
         poses = self.search.poses(frames)
         if not len(poses):
             return poses
@@ -428,8 +428,8 @@ class BallTracker:
         return poses_of(fit, fit.nll.argsort(stable=True), seen, reason)
 
     def looked_past(self, poses: Poses, frames: Sequence[Frame], among: Neighbours) -> Poses:
-        """Fit M poses that a search found past the other balls `among`, of one pose, in the cameras that see this one;
-        those whose pictures support none are left out.
+        """Fit M poses found by a search, with the other balls `among`, of one pose, in the cameras that see this one;
+        cameras that support none are left out.
         """
         fitter, count = self.search.fitter, len(poses)
         pictures, X = [shot.picture for shot in frames], poses.position_lab_mm[:1]
@@ -461,7 +461,7 @@ class BallTracker:
         return self.search.fitter.fit_through(steps, [pictures] * count, begin)
 
     def _by_each(self, poses: Poses, pictures: Sequence[Picture], seen: Tensor) -> Poses:
-        """Fit poses to as many cameras as one supports; of equally many the first count, the others contradict."""
+        """Fit poses to the largest set of cameras that supports one, of equal sets the first; the others contradict."""
         each = seen.expand(len(poses), -1)
         steps = ((self.search.fitter.optics.fine, 1, 4),)
 
@@ -484,7 +484,7 @@ class BallTracker:
         return poses_of(fit, fit.nll.argsort(stable=True), _only(each, main)[0], reason)
 
     def _all_seeing(self, poses: Poses, pictures: Sequence[Picture], usable: Tensor) -> Poses:
-        """Fit poses to all pictures, kept if that explains all: a disk without an outline may be visible."""
+        """Fit poses to all pictures; kept if that explains all, as a disk without an outline may be visible."""
         fit = self._looked_at(pictures, poses, usable, self.search.fitter.optics.steps)
         order = fit.nll.argsort(stable=True)
         if not bool(self._supported(fit, usable.expand(len(poses), -1))[order[0]]):
@@ -504,7 +504,7 @@ def _only(usable: Tensor, cameras: Sequence[int]) -> Tensor:
 
 
 def _beside(fit: FittedPoses, other: FittedPoses, rows: Tensor, camera: int) -> FittedPoses:
-    """Record what a camera alone gives beside poses (B,) to which it did not contribute."""
+    """Record the results of a camera that did not contribute to poses (B,)."""
     if not bool(rows.any()):
         return fit
     own = {

@@ -1,4 +1,4 @@
-"""The fixed centre of a sphere that only rotates, from a few frames; all frames are then fitted there."""
+"""The fixed centre of a sphere that only rotates, from a few frames; all frames are then fitted at it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,35 +17,35 @@ from sphereorient.pose.residuals import EDGE_PX
 
 ROUNDS = 10  # of robust weights
 USUAL = 2.366  # median of chi squared with three degrees of freedom
-FAR = 2.0  # usual distances at which a frame counts for half
-FOLLOWS_EVERY = 4  # every n-th pixel; this derivative need not be precise
-ASIDE = 0.005  # of the radius: how far aside that is tried
-FIRM = 0.01  # of the centre's error: how far a frame may move a fit from the centre
+FAR = 2.0  # usual distances at which a frame has half weight
+FOLLOWS_EVERY = 4  # every n-th pixel, as this derivative need not be precise
+ASIDE = 0.005  # of the radius: step of the finite difference
+FIRM = 0.01  # of the centre's error: allowed displacement of a fit from the centre
 ITERATIONS = 3  # of the fits; they start at the result of a search
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FixedCentre:
-    """Centre of a sphere in all frames; made by `find_fixed_centre`."""
+    """Centre of a sphere in all frames."""
 
     position_lab_mm: Tensor  # (3,) float64
-    covariance_mm2: Tensor  # (3, 3), of its error, which is one and the same in all frames
-    follows_rad_mm: Tensor  # (3, 3), error of the orientation, delta lab, per error of the centre: mean over frames
+    covariance_mm2: Tensor  # (3, 3), of its error, common to all frames
+    follows_rad_mm: Tensor  # (3, 3), derivative of the orientation, delta lab, by the centre: mean over frames
 
     @cached_property
     def spread_mm2(self) -> Tensor:
-        """Covariance (3, 3) that holds fits at the centre to FIRM of its error."""
+        """Covariance (3, 3) of the prior that holds fits at the centre, to FIRM of its error."""
         return FIRM**2 * self.covariance_mm2
 
     @property
     def precision(self) -> Tensor:
-        """Its inverse, 1/mm^2."""
+        """Inverse of `spread_mm2`, 1/mm^2."""
         inverse: Tensor = torch.linalg.inv(self.spread_mm2)
         return inverse
 
     @cached_property
     def lasting(self) -> Tensor:
-        """Covariance (6, 6) of what its error does to delta (rad) and position (mm) of all poses held here."""
+        """Covariance (6, 6) of delta (rad) and position (mm) of all poses held here, due to the centre's error."""
         follows = torch.cat([self.follows_rad_mm, torch.eye(3, dtype=self.follows_rad_mm.dtype)])
         whole: Tensor = follows @ self.covariance_mm2 @ follows.mT
         return whole
@@ -53,7 +53,7 @@ class FixedCentre:
 
 def find_fixed_centre(search: Initialiser, frames: Sequence[Sequence[Frame]], score_min: float) -> FixedCentre | None:
     """Find the centre of a sphere that only rotates, from n x C frames and their poses of at least `score_min`.
-    None where no frame has a pose that all of its pictures support.
+    None if no frame has a pose supported by all of its pictures.
     """
     fitter = search.fitter
     found = search.all_poses(frames)
@@ -87,7 +87,7 @@ def follows_place(fitter: Fitter, pixels: Pixels, place: Tensor, R: Tensor, use:
 
 def mean_place(position_lab_mm: Tensor, covariance_mm2: Tensor) -> tuple[Tensor, Tensor]:
     """Return the robust mean (3,) of n >= 1 independent positions (n, 3), mm, and its covariance (3, 3).
-    It is wider where the positions scatter more than their covariances (n, 3, 3).
+    The covariance is wider if the positions scatter more than their covariances (n, 3, 3).
     """
     X, precision = position_lab_mm.double(), torch.linalg.inv(covariance_mm2.double())
     place, weight, away = X.median(0).values, X.new_ones(len(X)), X.new_zeros(len(X))
@@ -104,7 +104,7 @@ def mean_place(position_lab_mm: Tensor, covariance_mm2: Tensor) -> tuple[Tensor,
 
 
 def _edge(fitter: Fitter, position_lab_mm: Tensor) -> Tensor:
-    """Return the covariance (3, 3), mm^2, of a limb that lies EDGE_PX off in all frames, to one side or all around."""
+    """Return the covariance (3, 3), mm^2, of a limb that is off by EDGE_PX in all frames, to one side or all around."""
     radius_px = torch.stack([view.radius_px(position_lab_mm, fitter.radius_mm) for view in fitter.views])
     aside = EDGE_PX * fitter.radius_mm / float(radius_px.min())
     covariance = aside**2 * torch.eye(3, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Tracking batch by batch, while the next one is decoded; all cameras together, or those that agree."""
+"""Tracking batch by batch, decoding the next batch meanwhile; all cameras together, or those that agree."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -23,22 +23,22 @@ from sphereorient.locate.outline import Outline
 from sphereorient.pose import CameraView
 from sphereorient.pose.poses import Poses, no_pose
 
-MOST, KEPT = 8, 2  # times the frames that are wanted: looked at, and kept
-SHOWN = 0.75  # of the frames that are wanted, in which each camera is to show the ball
-FEWEST = 4  # frames that show it
+MOST, KEPT = 8, 2  # times the wanted number of frames: examined, and kept
+SHOWN = 0.75  # of the wanted frames, in which each camera should show the ball
+FEWEST = 4  # frames that show the ball
 DECODING = 2  # threads in which parts of pictures are decoded
 
 
 class PerCameraTracker:
-    """Tracks the sphere in the cameras that agree, and in each other one alone; the first of these that sees it gives
-    the pose, the others contradict.
+    """Tracks the sphere in the agreeing cameras together, and in each other one alone. The first of these that sees it
+    gives the pose; the others are recorded as contradicting.
     """
 
     def __init__(self, name: str, appearance: Appearance, search: Initialiser, settings: RefineSettings) -> None:
         others = [(k,) for k in range(len(appearance.fitter.views)) if k not in appearance.majority]
         self.parts = [part for part in (appearance.majority, *others) if part]
         balls = [BallTracker(appearance.of(*part), search, settings) for part in self.parts]
-        self.balls: dict[str, BallTracker] = {}  # that are followed in all cameras together
+        self.balls: dict[str, BallTracker] = {}  # followed in all cameras together
         self.trackers = [Tracker({name: ball}) for ball in balls]
 
     def batches(self, frames: range) -> list[list[int]]:
@@ -58,7 +58,7 @@ class PerCameraTracker:
 
 
 def cameras_disagree(apart: Sequence[Poses], parts: Sequence[Sequence[int]]) -> Poses:
-    """Return one frame's poses of the first part of C cameras that sees the sphere, and what the others say alone."""
+    """Return one frame's poses by the first part of C cameras that sees the sphere, and the others' own results."""
     why = dict(pair for poses, part in zip(apart, parts, strict=True) for pair in zip(part, poses.reason, strict=True))
     reason = [why[k] for k in range(len(why))]
     seeing = [k for k, poses in enumerate(apart) if len(poses) and bool(poses.use.any())]
@@ -73,7 +73,7 @@ def cameras_disagree(apart: Sequence[Poses], parts: Sequence[Sequence[int]]) -> 
         arrays[name] = whole
     for other, (k, *several) in ((apart[part], parts[part]) for part in seeing):
         if several:
-            continue  # only the first part, those that agree, has more than one
+            continue  # only the first part, the agreeing cameras, has more than one
         arrays["own_turn"][:, k] = so3.log(other.R_lab_body[:1] @ main.R_lab_body.mT)
         arrays["own_move"][:, k] = other.position_lab_mm[:1] - main.position_lab_mm
         if other is not main:
@@ -85,7 +85,7 @@ def cameras_disagree(apart: Sequence[Poses], parts: Sequence[Sequence[int]]) -> 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Batch:
-    """Chunks of frames that are tracked together; frames first .. last - 1, counted from the first one used."""
+    """Chunks of frames tracked together; frames first .. last - 1, counted from the first one used."""
 
     first: int
     last: int
@@ -98,7 +98,7 @@ class Batch:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Follower:
-    """What single frames are measured with; made by a method, read by `run`."""
+    """The tracker, its movies and its appearance, made by a method, read by `run`."""
 
     recording: Recording
     appearances: Mapping[str, Appearance]  # of each ball, by name
@@ -106,7 +106,7 @@ class Follower:
 
     @property
     def appearance(self) -> Appearance:
-        """That of an only ball."""
+        """Appearance of the only ball."""
         (only,) = self.appearances.values()
         return only
 
@@ -139,7 +139,7 @@ class Follower:
             def read_on(movie: Iterator[Frame], batch: Batch) -> list[Frame]:
                 frames = list(islice(movie, len(batch)))
                 for begin in accumulate([0, *batch.lengths[:-1]]):
-                    _ = frames[begin].reason  # what a chunk begins with is decoded whole
+                    _ = frames[begin].reason  # the first frames of a chunk are decoded whole
                 return frames
 
             def ahead(batch: Batch) -> list[Future[list[Frame]]]:
@@ -158,7 +158,7 @@ def sample_frames(
     recording: Recording, views: Sequence[CameraView], count: int
 ) -> tuple[list[tuple[Frame, ...]], list[int]]:
     """Return `count` frames of all cameras, spread over the movies, each the first readable one of its stretch, and
-    their places among the frames in use.
+    their indices among the frames in use.
     """
     total = len(recording.timeline)
     spread = spread_frames(range(total), count)
@@ -178,7 +178,7 @@ def sample_frames(
                 break
         return best, place
 
-    with ThreadPoolExecutor(DECODING) as parts:  # `usable` decodes all of a picture
+    with ThreadPoolExecutor(DECODING) as parts:  # `usable` decodes the whole picture
         found = list(side_by_side(of_stretch, zip(spread, [*spread[1:], total], strict=True)))
     return [frames for frames, _ in found], [place for _, place in found]
 
@@ -189,11 +189,11 @@ def frames_showing(
     count: int,
     disks: Callable[[Sequence[Frame]], list[Outline | None]],
 ) -> tuple[list[tuple[Frame, ...]], list[int]]:
-    """Return frames of all cameras that show the ball, spread over the movies, and their places among the frames in
-    use. `disks` finds it in the C pictures of a frame. `count` frames are looked at, and more, up to `MOST` times as
-    many, until each camera shows it in `SHOWN` of that count. Of these as many are returned as hold the pictures of
-    `KEPT` times `count` frames of all cameras, those that most cameras show, evenly spread. Where hardly a frame shows
-    it, the first `count` are returned.
+    """Return frames of all cameras that show the ball, spread over the movies, and their indices among the frames in
+    use. `disks` finds it in the C pictures of a frame. At least `count` and up to `MOST` times as many frames are
+    examined, until each camera shows the ball in `SHOWN` of `count`. Those that most cameras show are returned, evenly
+    spread, with as many pictures as `KEPT` times `count` frames of all cameras have. If hardly any frame shows the
+    ball, the first `count` are returned.
     """
     frames, places = sample_frames(recording, views, count)
     looked, total, times = list(places), len(recording.timeline), 1
@@ -219,12 +219,12 @@ def frames_showing(
 
 
 def frames_at(recording: Recording, views: Sequence[CameraView], places: Sequence[int]) -> list[tuple[Frame, ...]]:
-    """Return the frames of all cameras at some places among the frames in use."""
+    """Return the frames of all cameras at some indices among the frames in use."""
 
     def at(k: int) -> tuple[Frame, ...]:
         pairs = zip(recording.streams, views, strict=True)
         frames = tuple(next(screened_frames(stream, view.background, k, k + 1, parts)) for stream, view in pairs)
-        _ = [shot.reason for shot in frames]  # decodes all of a picture
+        _ = [shot.reason for shot in frames]  # decodes the whole picture
         return frames
 
     with ThreadPoolExecutor(DECODING) as parts:

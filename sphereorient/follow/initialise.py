@@ -26,16 +26,16 @@ from sphereorient.search.normalisation import crop_disk
 Place = TypeVar("Place", Blob, Outline)
 
 UNPROVEN = -1.0  # score of no pose
-DISTINCT_RAD = 0.12  # fits nearer than this are the same orientation; the widest fit's basin
-PLACE_SHARE = 0.03  # of the radius: how far an outline's centre may be off, dark rims included
-DEPTH_SHARE = 0.08  # of the distance: how far off it may be where only one outline's size gives it
+DISTINCT_RAD = 0.12  # fits nearer than this are the same orientation; basin of the widest fit
+PLACE_SHARE = 0.03  # of the radius: largest error of an outline's centre, with dark rims
+DEPTH_SHARE = 0.08  # of the distance: its largest error from the size of one outline
 NARROWER = (0.15, 0.06)  # allowed deviations from the usual diameter in repeated searches
-CLEARLY_LESS = 0.1  # of a picture's variance: a pose that explains so much less than another is wrong, likely or not
-SURE_NLL = 20.0  # by so much less likely
-GAP_SHARE = 0.3  # of the radius: lines of sight that pass at a greater distance see different things
+CLEARLY_LESS = 0.1  # of a picture's variance: a pose that explains less than another by this is wrong
+SURE_NLL = 20.0  # difference of nll of a clearly less likely pose
+GAP_SHARE = 0.3  # of the radius: lines of sight with a larger gap show different objects
 STEP, REACH = 0.2, 2  # of `relocalise`: step, radii, and steps to each side of the blob
-RIVAL_BLOB, RIVAL_SCORE = 0.3, 0.8  # of the best blob's merit, of the best score: could be the sphere as well
-FAINT = 0.3  # of the merit of the faintest blob that is proven to be the sphere: fainter ones are not looked at
+RIVAL_BLOB, RIVAL_SCORE = 0.3, 0.8  # of the best blob's merit, of the best score: from these it may be the sphere too
+FAINT = 0.3  # of the merit of the faintest blob proven to be the sphere: fainter ones are ignored
 LOOSE = 0.15  # of the radius: error of a position without an outline
 
 
@@ -46,23 +46,23 @@ class Initialiser:
     fitter: Fitter  # of C views
     proposers: Mapping[str, Proposer]  # by name of view
     locating: LocateSettings
-    candidates: int  # proposals of each camera that are fitted
-    score_min: float = 0.0  # where no picture is explained this well, other outlines are tried
-    finalists: int = 2  # poses that are fitted to all detail
-    least: float | None = None  # score of proposals; None: as the proposer's settings say
-    # What was found in pictures looked at before, by id, whatever the fitter; None: none of them is looked at again.
+    candidates: int  # fitted proposals of each camera
+    score_min: float = 0.0  # if no picture reaches it, other outlines are tried
+    finalists: int = 2  # poses fitted to full detail
+    least: float | None = None  # score of proposals; None: by the proposer's settings
+    # Results for earlier pictures, by id, whatever the fitter; None: not kept.
     known: dict[tuple[int, Hashable], tuple[Picture, Any]] | None = None
 
     def all_poses(self, frames: Sequence[Sequence[Frame]]) -> list[Poses]:
         """Find the poses of n frames of C pictures; see `poses`."""
-        with ThreadPoolExecutor(2) as pool:  # outlines and products of matrices leave the interpreter free
+        with ThreadPoolExecutor(2) as pool:  # outlines and matrix products release the GIL
             return list(pool.map(self.poses, frames))
 
     def poses(self, frames: Sequence[Frame]) -> Poses:
-        """Find all poses that the C pictures of one instant allow; unusable pictures take no part.
-        Black paint that hides half of a rim leaves arcs that a smaller circle fits as well: where no picture is
-        explained well, outlines nearer to the usual size are tried, and the texture locates the disk. Where neither an
-        outline nor the texture is found, there is no ball.
+        """Find all poses consistent with the C pictures of one instant; unusable pictures are left out.
+        If black paint hides half of a rim, a smaller circle fits the remaining arcs too: if no picture is explained
+        well, outlines nearer the usual size are tried, and the texture locates the disk. If neither outline nor texture
+        is found, there is no ball.
         """
         if self.known is None:
             return replace(self, known={}).poses(frames)
@@ -84,13 +84,13 @@ class Initialiser:
         return max(poses, self._search(frames, textured), key=_best_score)
 
     def _looked_at(self, shot: Frame, view: CameraView) -> Frame:
-        """Return a frame that is not used further where it shows no blob like the sphere's."""
+        """Return a frame, marked unusable if it shows no blob like the sphere's."""
         if not shot.usable or view.merit_min == 0.0 or self._blobs(shot.picture, view):
             return shot
         return Frame(shown=shot.shown, read=Reason.NOT_FOUND)
 
     def merit(self, picture: Picture, view: CameraView) -> float:
-        """Return the merit of the best blob of a picture, 0 without one."""
+        """Return the merit of the best blob of a picture; 0 without one."""
         return max((blob.merit for blob in self._blobs(picture, view)), default=0.0)
 
     def _blobs(self, picture: Picture, view: CameraView) -> list[Blob]:
@@ -108,7 +108,7 @@ class Initialiser:
         seeing = [k for k, (outline, _) in enumerate(found) if outline is not None]
         if len(seeing) < 2 or self._meet(found):
             return self._search(frames, found)
-        # The cameras see different things: take those whose lines of sight meet and whose pictures are explained best.
+        # The cameras see different objects: take those with meeting lines of sight and the best scores.
         for some in by_decreasing_size(seeing):
             each = [[one if k in kept else (None, Reason.OUTLINE) for k, one in enumerate(found)] for kept in some]
             if meeting := [one for one in each if self._meet(one)]:
@@ -116,12 +116,12 @@ class Initialiser:
         return max((self._search(frames, one) for one in meeting), key=_best_score)
 
     def _meet(self, found: Sequence[Found]) -> bool:
-        """Return whether the lines of sight meet; that of one camera does."""
+        """Return whether the lines of sight meet; true for one camera."""
         return not float(self._placed(found).gap_mm[0]) > GAP_SHARE * self.fitter.radius_mm
 
     def glanced(self, frames: Sequence[Frame], place: Tensor | None = None) -> Poses:
-        """Return the likeliest pose by blobs of the usual size alone, or with the ball at a `place` (3,), lab, mm; or
-        that there is none. It is right to some degrees and pixels, in a quarter of the time of `poses`.
+        """Return the likeliest pose by blobs of the usual size alone, or with the ball at `place` (3,), lab, mm; or no
+        pose. It is right to some degrees and pixels, and takes a quarter of the time of `poses`.
         """
         fitter, views = self.fitter, self.fitter.views
         if place is None:
@@ -160,8 +160,8 @@ class Initialiser:
         return _usual_disk((blobs[0].u_px, blobs[0].v_px), view.diameter_px / 2), Reason.OK
 
     def _glimpsed(self, view: CameraView, picture: Picture, disk: Outline) -> tuple[Tensor, Tensor, Tensor]:
-        """Return rotations (M, 3, 3), lab, in which a disk may show the ball, right to some degrees; and where the ball
-        is by its size (1, 3), mm, with the precision of that (1, 3, 3), 1/mm^2.
+        """Return rotations (M, 3, 3), lab, in which a disk may show the ball, right to some degrees; and the ball's
+        position by its size (1, 3), mm, with its precision (1, 3, 3), 1/mm^2.
         """
         proposer, camera, radius_mm = self.proposers[view.name], view.camera, self.fitter.radius_mm
         near = proposer.rough(torch.from_numpy(crop_disk(picture, *disk.circle, proposer.size_px))[None]).R_view_body
@@ -197,7 +197,7 @@ class Initialiser:
     def _relocalised(self, picture: Picture, view: CameraView) -> Found:
         proposer, radius, blobs = self.proposers[view.name], view.diameter_px / 2, self._blobs(picture, view)
         if self.outline(picture, view)[0] is None:
-            # A ball without an outline is as clear as those that are proven, or the border of the picture cuts it.
+            # A ball without an outline has as much merit as a proven one, or is cut by the picture's border.
             clear, size = view.merit_min / FAINT, torch.tensor(radius)
             blobs = [
                 one
@@ -208,7 +208,7 @@ class Initialiser:
         if not places:
             return None, Reason.NOT_FOUND
         steps = [STEP * radius * k for k in range(-REACH, REACH + 1)]
-        for around in ([0.0], steps):  # the likeliest blob, then the likeliest place about it
+        for around in ([0.0], steps):  # the likeliest blob, then the likeliest place near it
             places = [(u + right, v + down) for u, v in places for down in around for right in around]
             disks = [torch.from_numpy(crop_disk(picture, u, v, radius, proposer.size_px)) for u, v in places]
             places = [places[int(proposer.likeness(torch.stack(disks)).argmax())]]
@@ -218,7 +218,7 @@ class Initialiser:
         return (disk, Reason.OK) if len(R) else (None, Reason.LOW_SCORE)
 
     def claimants(self, frames: Sequence[Frame]) -> int:
-        """Return how many disks wear the texture map about equally well, in the camera that shows most of them."""
+        """Return how many disks fit the texture map about equally well, in the camera with most of them."""
         pairs = zip(self.fitter.views, frames, strict=True)
         return max((self._claimants(shot.picture, view) for view, shot in pairs if shot.usable), default=0)
 
@@ -244,12 +244,12 @@ class Initialiser:
         return int((best > RIVAL_SCORE * best.max()).sum())
 
     def _once(self, picture: Picture, key: Hashable, find: Callable[[], Any]) -> Any:
-        """Return what `find` does, or did when the same picture was looked at with this key."""
+        """Return the result of `find`, or the earlier one for the same picture and key."""
         if self.known is None:
             return find()
         place = id(picture), key
         if place not in self.known:
-            self.known[place] = picture, find()  # the picture is kept: its identity is that of no other
+            self.known[place] = picture, find()  # keep the picture, so that no other gets its id
         return self.known[place][1]
 
     def _found(self, frames: Sequence[Frame], find: Callable[[Picture, CameraView], Found]) -> list[Found]:
@@ -265,7 +265,7 @@ class Initialiser:
 
     def proposals(self, disks: Sequence[tuple[int, Picture, Outline]]) -> list[tuple[Tensor, Tensor]]:
         """Return rotations (M, 3, 3), lab, in which each disk of a camera's picture may show the ball, and their scores
-        (M,), best first. Disks of one proposer are looked at together.
+        (M,), best first. Disks of one proposer are processed together.
         """
         crops: dict[int, list[Tensor]] = {}
         for k, picture, disk in disks:
@@ -291,13 +291,13 @@ class Initialiser:
         return self.fitted(frames, found, torch.cat([none, *(self._proposed(*one)[0] for one in seen)]))
 
     def _proposed(self, k: int, picture: Picture, disk: Outline) -> tuple[Tensor, Tensor]:
-        """Return the proposals of one disk of camera `k`, alone: sums depend on how many are added."""
+        """Return the proposals of one disk of camera `k` alone: rounding depends on the size of a batch."""
         key, look = (self.fitter.views[k].name, disk), partial(self.proposals, [(k, picture, disk)])
         ((R, score),) = self._once(picture, key, look)
         return R, score
 
     def fitted(self, frames: Sequence[Frame], found: Sequence[Found], R: Tensor) -> Poses:
-        """Return the poses that C pictures allow of a ball with these outlines, fitted from rotations R (M, 3, 3)."""
+        """Return the poses in C pictures of a ball with these outlines, fitted from rotations R (M, 3, 3)."""
         fitter, views, reason = self.fitter, self.fitter.views, [why for _, why in found]
         use = torch.tensor([outline is not None for outline, _ in found])
         if not use.any() or not len(R):
@@ -306,7 +306,7 @@ class Initialiser:
         slack = torch.nan_to_num(placed.covariance_mm2[0])
         slack = slack + (PLACE_SHARE * fitter.radius_mm) ** 2 * torch.eye(3).double()
         if int(use.sum()) == 1:
-            # Arcs of a partly dark rim fit a smaller circle as well, with no greater residual.
+            # A smaller circle fits the arcs of a partly dark rim with no greater residual.
             (seeing,) = (view for view, used in zip(views, use.tolist(), strict=True) if used)
             sight = seeing.camera.rays(seeing.camera.project(placed.position_lab_mm))
             along = placed.position_lab_mm[0] - sight.origin_lab_mm[0]
@@ -325,7 +325,7 @@ class Initialiser:
             # All starts of a level use the same pixels: those about the position of the outlines.
             one = fitter.pixels([pictures], place, level).thinned(every)
             if level is optics.fine and every == 1 and fitter.light.known:
-                one = fitter.unoccluded(one, X[:1], R[:1])  # by the likeliest pose; the same pixels for all
+                one = fitter.unoccluded(one, X[:1], R[:1])  # by the likeliest pose; all use the same pixels
             pixels = one.where(torch.arange(len(one)).repeat(len(R)))
             fit = fitter.fit(pixels, PoseStart(X, R, use.expand(len(R), -1), held), level, iterations)
             fit = replace(fit, nll=explaining_first(fit, use))
@@ -336,20 +336,20 @@ class Initialiser:
             place = X[:1]
         hidden = [bool(used) and bool(fitter.shows_unknown(k, X[:1], R[:1]).any()) for k, used in enumerate(use)]
         shown = use & ~torch.tensor(hidden)
-        if not bool(shown.any()):  # no camera is better than another
+        if not bool(shown.any()):  # all cameras are equal
             return poses_of(fit, chosen, use, reason)
         reason = [Reason.UNSEEN if unknown else why for unknown, why in zip(hidden, reason, strict=True)]
         return poses_of(fit, chosen, shown, reason)
 
 
 def _usual_disk(centre_px: Sequence[float], radius_px: float) -> Outline:
-    """Return a disk about a place that no outline proves."""
+    """Return a disk of usual size at a place without a proven outline."""
     u, v = centre_px
     return Outline(u_px=u, v_px=v, radius_px=radius_px, rms_px=LOOSE * radius_px, coverage=0.0)
 
 
 def _distinct_places(places: Sequence[Place], radius_px: float) -> list[Place]:
-    """Return the places, best first, that lie more than a radius from all better ones."""
+    """Return the places, best first, more than a radius from all better ones."""
     kept: list[Place] = []
     for one in places:
         if all(math.hypot(one.u_px - other.u_px, one.v_px - other.v_px) > radius_px for other in kept):
@@ -362,14 +362,14 @@ def _best_score(poses: Poses) -> float:
 
 
 def by_decreasing_size(cameras: Sequence[int]) -> Iterator[list[tuple[int, ...]]]:
-    """Yield all subsets of one size, from those without one camera to those of a single one."""
+    """Yield all subsets, size by size, from all but one camera down to single ones."""
     for size in range(len(cameras) - 1, 0, -1):
         yield list(combinations(cameras, size))
 
 
 def explaining_first(fit: FittedPoses, use: Tensor) -> Tensor:
-    """Return nll (M,) with poses of clearly lower score in the cameras of `use` (C,) bool behind the others:
-    likelihood forgives wide scatter. A disk of unknown paint has no score.
+    """Return nll (M,), with poses of clearly lower score in the cameras of `use` (C,) bool put behind the others:
+    likelihood tolerates wide scatter. A disk of unknown paint has no score.
     """
     nll, known = fit.nll, use & (fit.score != 0)
     score = torch.where(known, fit.score, 0.0).sum(-1) / known.sum(-1)
@@ -382,7 +382,7 @@ def explaining_first(fit: FittedPoses, use: Tensor) -> Tensor:
 
 
 def distinct_indices(R: Tensor, nll: Tensor, count: int) -> Tensor:
-    """Return the indices of at most `count` rotations (M, 3, 3), most likely first, none near a likelier one."""
+    """Return the indices of at most `count` rotations (M, 3, 3), likeliest first, none near a likelier one."""
     near = so3.geodesic_distance(R[:, None], R[None]) < DISTINCT_RAD
     left = torch.isfinite(nll)
     chosen: list[int] = []

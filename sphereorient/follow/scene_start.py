@@ -1,4 +1,4 @@
-"""The start of a frame of several balls: disks, their matches over cameras, the paint of each, one assignment."""
+"""Search of a frame for several balls: disks, their matches over cameras, the paint of each, one assignment."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -19,33 +19,33 @@ from sphereorient.locate.outline import Outline
 from sphereorient.pose.poses import Poses, no_pose
 
 Floats = NDArray[np.float64]
-Kind = tuple[float, ...]  # the same for balls that are alike
+Kind = tuple[float, ...]  # the same for balls of the same paint and radius
 SceneFound = Mapping[str, Poses]  # of each ball in one frame
 
-EXPLAINED = 0.35  # of the radius: a disk whose middle is that near to a known ball is its own
-PATCHES = 40.0  # of paint on a disk that say something of their own
-NO_PAINT = 0.65  # score from which a picture speaks for a paint: right ones 0.73 to 0.98, wrong ones up to 0.6
-ALIKE_RAD = 0.26  # rotations nearer than this are the same: proposals err by some degrees
-ANOTHER = 1.0  # price of a disk that shows another rotation than the others of its match
-NOT_SEEN = 3.0  # price of a ball that is not found
-MISSED = 4.0  # price of a picture that holds the place of a ball but not its disk: else a ball would count as two
+EXPLAINED = 0.35  # of the radius: a disk with its middle this near a known ball's belongs to it
+PATCHES = 40.0  # independent patches of paint on a disk
+NO_PAINT = 0.65  # score from which a picture supports a paint: right ones have 0.73 to 0.98, wrong ones up to 0.6
+ALIKE_RAD = 0.26  # rotations nearer than this are the same, as proposals err by some degrees
+ANOTHER = 1.0  # cost of a disk with another rotation than the others of its match
+NOT_SEEN = 3.0  # cost of a ball that is not found
+MISSED = 4.0  # cost of a picture that should show a ball's disk but does not: else one ball counts as two
 SIZE_SIGMA = 0.06  # relative, of the radius of a disk
-DEPTH_SIGMA = 0.15  # relative, of the distance of a ball of which one camera alone tells
+DEPTH_SIGMA = 0.15  # relative, of a ball's distance by one camera alone
 PROPOSED_RAD, PLACED_SHARE = 0.05, 0.1  # errors of proposals and, in radii, of matches beside a prediction
-FREEDOM = 6.0  # of Student's distribution: motions change, and diameters are entered wrongly
+FREEDOM = 6.0  # of Student's distribution, for changes of motion and wrong diameters
 
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """A paint at a match: the gain of its log-likelihood over an unknown one, and the rotations from which to fit."""
+    """A paint at a match: the gain of its log-likelihood over an unknown paint, and the rotations from which to fit."""
 
     gain: float
     R_lab_body: Tensor  # (M, 3, 3), best first
 
 
 class SceneStart:
-    """Finds balls in frames in which no prediction can be fitted. `balls` are all of the scene; those of the same
-    proposers and radius are alike: no picture tells them apart.
+    """Finds balls in frames where no prediction can be fitted. `balls` are all of the scene; those with the same
+    proposers and radius cannot be distinguished in a picture.
     """
 
     def __init__(self, balls: Mapping[str, Initialiser]) -> None:
@@ -65,8 +65,8 @@ class SceneStart:
         past: Mapping[str, Ahead] | None = None,
     ) -> dict[str, Poses]:
         """Find the named balls in the pictures of one instant, frames of C views. `known`: positions (3,), lab, mm, of
-        other balls in this frame; `past`: what is expected of those looked for. Without it balls that are alike come in
-        any order. A ball that is not found has no pose, but each camera's reason.
+        other balls in this frame; `past`: predictions of the named balls; without it, equal balls come in any order. A
+        ball that is not found has no pose, but each camera's reason.
         """
         disks = self._unexplained(frames, known)
         matches = match_disks(disks, list(self.cameras.values()))
@@ -82,7 +82,7 @@ class SceneStart:
                         for disk, shot in zip(matches[n].disks, frames, strict=True)
                     ]
                     fits[kind, n] = self.balls[name].fitted(frames, found, looks[kind][n].R_lab_body)
-            # A paint is wrong that explains the pictures in use no better than an unknown one.
+            # A paint that explains the pictures in use no better than an unknown paint is wrong.
             gains = {(kind, n): _gain(fits[kind, n].score[:1, fits[kind, n].use]).sum() for kind, n, _ in pairs}
             wrong = {each for each, gain in gains.items() if not float(gain) > 0}
             if not wrong:
@@ -94,7 +94,7 @@ class SceneStart:
         return {name: found_[name] if name in found_ else no_pose(len(frames), reason) for name in names}
 
     def _unexplained(self, frames: Sequence[Frame], known: Mapping[str, Tensor]) -> list[list[Outline]]:
-        """Return the disks of each picture without those of balls at known positions."""
+        """Return the disks of each picture, without those of balls at known positions."""
         of_balls = [one.fitter.views for one in self.balls.values()]
         disks = []
         for k, shot in enumerate(frames):
@@ -112,7 +112,7 @@ class SceneStart:
     def _looks(
         self, name: str, frames: Sequence[Frame], disks: Sequence[Sequence[Outline]], matches: Sequence[Match]
     ) -> list[_Look]:
-        """Return how the paint of a ball looks at each match."""
+        """Return the look of a ball's paint at each match."""
         ball = self.balls[name]
         where = [(k, n) for k, seen in enumerate(disks) for n in range(len(seen))]
         proposed = ball.proposals([(k, frames[k].picture, disks[k][n]) for k, n in where])
@@ -127,7 +127,7 @@ class SceneStart:
         looks: Mapping[Kind, Sequence[_Look]],
         ahead: Ahead | None,
     ) -> Floats:
-        """Return the cost (N,) of each match for a ball: negative log-likelihood beside that of not seeing it."""
+        """Return the cost (N,) of each match for a ball: negative log-likelihood relative to not seeing it."""
         if not matches:
             return np.zeros(0)
         ball, look = self.balls[name], looks[self._kind[name]]
@@ -153,7 +153,7 @@ class SceneStart:
 
 
 def _gain(score: Tensor) -> Tensor:
-    """Return by how much the log-likelihood of a paint exceeds that of an unknown one, for scores of pictures."""
+    """Return the gain of log-likelihood of a paint over an unknown one, for scores of pictures."""
     return 0.5 * PATCHES * ((1 - NO_PAINT) / (1 - score.clamp(-1.0, 0.99))).log()
 
 
@@ -175,7 +175,7 @@ def look_of(proposed: Sequence[tuple[Tensor, Tensor]]) -> _Look:
 
 
 def _surprise(ahead: Ahead, X: Tensor, covariance_mm2: Tensor, R: Tensor, radius_mm: float) -> Floats:
-    """Return negative log-likelihoods (N,) of positions (N, 3) and rotations (N, 3, 3) after a prediction."""
+    """Return negative log-likelihoods (N,) of positions (N, 3) and rotations (N, 3, 3) under a prediction."""
     away = torch.cat([so3.log(R @ ahead.R_lab_body.mT), X - ahead.position_lab_mm], dim=-1)
     spread = ahead.covariance.expand(len(X), 6, 6).clone()
     spread[:, :3, :3] += PROPOSED_RAD**2 * torch.eye(3)
@@ -185,5 +185,5 @@ def _surprise(ahead: Ahead, X: Tensor, covariance_mm2: Tensor, R: Tensor, radius
 
 
 def _heavy_tailed(chi2: Tensor) -> Floats:
-    """Return negative log-likelihoods of chi2 (N,): half of it where it is small, but no paint is refused by it."""
+    """Return negative log-likelihoods of chi2 (N,): half of it if small; no paint is excluded."""
     return np.asarray(0.5 * FREEDOM * torch.log1p(chi2 / FREEDOM).numpy())

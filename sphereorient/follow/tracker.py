@@ -1,4 +1,4 @@
-"""Poses of all balls in all frames: a search at the first frame of a chunk, then each frame from those before it."""
+"""Poses of all balls in all frames: a search at the first frame of a chunk, then prediction from frame to frame."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -22,9 +22,9 @@ Start = Callable[[Sequence[Frame], Sequence[str], Mapping[str, Tensor], Mapping[
 
 
 class Tracker:
-    """Tracks balls through chunks of frames, each chunk by itself from a search without history, all balls in lock
-    step: each is fitted past the others where they are expected. Frame numbers alone decide where chunks begin: no
-    batch, worker or restart can change a result, and a wrong pose is lost with its chunk.
+    """Tracks balls through chunks of frames, each chunk independently from a search without history, all balls of a
+    frame together: each is fitted with the others at their predicted positions. Chunks begin at fixed frame numbers: no
+    batch, worker or restart changes a result, and a wrong pose does not outlive its chunk.
     """
 
     def __init__(self, balls: Mapping[str, BallTracker]) -> None:
@@ -48,7 +48,7 @@ class Tracker:
     def track(
         self, movies: Sequence[Sequence[Frame]], batch: Sequence[int], time_s: Sequence[float]
     ) -> Iterator[dict[str, Poses]]:
-        """Yield the poses of each ball in a batch's frames: movies of each view, lengths of the chunks, all times."""
+        """Yield the poses of each ball in a batch's frames: movies of each view, lengths of chunks, times."""
         firsts = list(accumulate([0, *batch[:-1]]))
         chunks = {name: [Chunk(first, time_s) for first in firsts] for name in self.balls}
         found: dict[int, dict[str, Poses]] = {}
@@ -74,15 +74,15 @@ class Tracker:
         time_s: Sequence[float],
         found: dict[int, dict[str, Poses]],
     ) -> None:
-        """Follow each ball of a chunk that was lost and found again back from there, and put its poses into `found`.
-        Where it does not arrive at the pose from which it was lost, two balls may have been taken for one: then a frame
-        between them stays without a pose.
+        """Follow each ball of a chunk that was lost and found again backwards from there, and put its poses into
+        `found`. If it does not arrive at the pose from which it was lost, two balls may have been confused: then a
+        frame between them gets no pose.
         """
         spans = [
             span for span in spans if any(regained([supported(found[k][name]) for k in span]) for name in self.balls)
         ]
         chunks = {name: mirrored(spans, time_s) for name in self.balls}
-        lost: dict[tuple[str, int], Poses] = {}  # what was found at first, where that has changed
+        lost: dict[tuple[str, int], Poses] = {}  # first results that were replaced
         for k in range(max(map(len, spans), default=0)):
             now = [n for n, span in enumerate(spans) if k < len(span)]
             numbers = [spans[n].stop - 1 - k for n in now]
@@ -132,7 +132,7 @@ class Tracker:
             for n in range(len(frames))
         ]
         rough = [any(one is not None and one.rough for one in row) for row in zip(*ahead.values(), strict=True)]
-        # Where a motion is not known yet, the others are looked past once all are found.
+        # Balls of unknown motion are fitted with their neighbours after all are found.
         first = [{} if no else row for no, row in zip(rough, known, strict=True)]
         found = self._followed(ahead, first, frames)
         if any(rough) and any(self._others.values()):
@@ -164,7 +164,7 @@ class Tracker:
         places: Sequence[Mapping[str, Tensor]],
         frames: Sequence[Sequence[Frame]],
     ) -> list[dict[str, Poses | None]]:
-        """Fit the predicted balls of each frame past the others at their places."""
+        """Fit the predicted balls of each frame, with the others at their places."""
         found: list[dict[str, Poses | None]] = [dict.fromkeys(self.balls) for _ in frames]
         for name, tracker in self.balls.items():
             rows = {n: one for n, one in enumerate(ahead[name]) if one is not None}
@@ -177,7 +177,7 @@ class Tracker:
         self,
         frame: tuple[dict[str, Poses], Mapping[str, Tensor], Sequence[Frame], Mapping[str, Ahead]],
     ) -> dict[str, Poses]:
-        """Return the poses of all balls of a frame: those followed, and those that a search finds."""
+        """Return the poses of all balls of a frame: the followed ones, and those found by a search."""
         done, known, frames, past = frame
         lost = [name for name in self.balls if name not in done]
         if not lost:
@@ -191,13 +191,13 @@ class Tracker:
         return {name: done[name] for name in self.balls}
 
     def _among(self, name: str, places: Mapping[str, Tensor]) -> Neighbours | None:
-        """Return the neighbours of one ball in one frame; None where there are none."""
+        """Return the neighbours of one ball in one frame; None if there are none."""
         others = self._others[name]
         return _neighbours(others, places) if others else None
 
 
 def among_found(rows: Sequence[tuple[str, Mapping[str, Poses]]], balls: Mapping[str, Initialiser]) -> Neighbours:
-    """Return the neighbours of balls, each given by its name and the poses of its frame, as if at rest."""
+    """Return the neighbours of balls, each given by its name and the poses of its frame, all at rest."""
     each = []
     for name, there in rows:
         places = {other: _found_place(poses, None) for other, poses in there.items() if len(poses)}
@@ -209,7 +209,7 @@ def among_found(rows: Sequence[tuple[str, Mapping[str, Poses]]], balls: Mapping[
 
 
 def _neighbours(radius_mm: Mapping[str, float], places: Mapping[str, Tensor]) -> Neighbours:
-    """Return the neighbours, by name, of one pose; a place (2, 3): position, and move while the shutter is open, mm."""
+    """Return the neighbours, by name, of one pose; a place (2, 3): position and displacement in the exposure, mm."""
     nowhere = torch.tensor([[torch.nan] * 3, [0.0] * 3], dtype=torch.float64)
     position, move = torch.stack([places.get(name, nowhere) for name in radius_mm], 1)[:, None]
     radii = torch.tensor([list(radius_mm.values())], dtype=torch.float64)
@@ -217,7 +217,7 @@ def _neighbours(radius_mm: Mapping[str, float], places: Mapping[str, Tensor]) ->
 
 
 def _same(one: Poses, other: Poses, tracker: BallTracker) -> bool:
-    """Return whether the best poses of a frame are the same, but for their errors."""
+    """Return whether the best poses of a frame are the same within their errors."""
     turn = so3.geodesic_distance(one.R_lab_body[0], other.R_lab_body[0])
     move = (one.position_lab_mm[0] - other.position_lab_mm[0]).norm()
     return bool(turn < DISTINCT_RAD) and bool(move < MOVE_SHARE * tracker.fitter.radius_mm)
@@ -228,6 +228,6 @@ def _expected_place(one: Expected) -> Tensor:
 
 
 def _found_place(poses: Poses, before: Tensor | None) -> Tensor:
-    """Return the place of a frame's best pose, with the motion that was expected of it."""
+    """Return the place of a frame's best pose, with its predicted motion."""
     X = poses.position_lab_mm[0]
     return torch.stack([X, torch.zeros_like(X) if before is None else before[1]])

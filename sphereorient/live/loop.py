@@ -95,7 +95,7 @@ def run_live(
     log: Log,
     fictrac: Path | None = None,
 ) -> Monitor:
-    """Track the frames of a source until its end or Ctrl-C. `outputs`: each with the attribute of `Forms` that it takes;
+    """Track the frames of a source until its end or Ctrl-C. `outputs`: each with its attribute of `Forms`;
     `log` gets messages for the user; `fictrac`: see `fictrac_axes`.
     """
     recording, tracker = opened.recording, opened.tracker

@@ -1,4 +1,4 @@
-"""The background of a movie, and the frames that show nothing against it: unreadable, dark, saturated or repeated."""
+"""The background of a movie, and frames without information: unreadable, dark, saturated or repeated."""
 
 from collections.abc import Iterator
 from concurrent.futures import Executor
@@ -16,13 +16,13 @@ from sphereorient.locate.outline import Levels, Mask
 
 Picture = NDArray[Any]
 # A pixel's noise is a quantile of its deviations over that of a unit normal. Measured mean: glitter is in more frames
-# than 1 - share, the sphere in fewer. Given scene: a tenth of the frames shows it where the sphere stays long.
+# than 1 - share, the sphere in fewer. Given scene: a tenth of the frames suffices, as the sphere may stay long.
 MEASURED_SHARE, MEASURED_SIGMAS = 0.8, 1.2816
 GIVEN_SHARE, GIVEN_SIGMAS = 0.1, 0.1257
-FREE = 4  # least frames in which no sphere covers a pixel, to measure it
+FREE = 4  # least frames without a sphere to measure a pixel
 LOUD = 5.0  # times the typical noise: a sphere passes
-CHANGING = 0.3  # share of loud pixels about one that belongs to a sphere that turns
-EVEN_DIAMETERS, EVEN_DIAMETER_PX = 2.2, 12.5  # side of the square of `even_scene`; diameter to which it is reduced
+CHANGING = 0.3  # share of loud pixels around one that belongs to a rotating sphere
+EVEN_DIAMETERS, EVEN_DIAMETER_PX = 2.2, 12.5  # side of the square of `even_scene`; reduced diameter
 FEW = 10  # frames; with fewer, all pixels get the same noise
 LIT_NOISES = 10.0  # a lit background pixel is this many noise sigmas above black
 LIT_SHARE = 0.1  # least share of lit pixels; in a darker scene a failed lamp is invisible
@@ -33,7 +33,7 @@ WHITE_SHARE = 0.5  # share of all pixels
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Background:
-    """Mean picture and noise of one movie; made by `learn_background`."""
+    """Mean picture and noise of one movie."""
 
     mean: Levels  # (H, W), grey levels
     noise: Levels  # (H, W), robust sigma about the mean, grey levels
@@ -61,7 +61,7 @@ def measure_background(pictures: NDArray[Any], empty: Levels | None = None) -> B
     full_scale = _full_scale(pictures)
     shape = pictures.shape[1:]
     mean, noise = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    for row in range(0, shape[0], 16):  # strips: a float copy of all frames is four times their size
+    for row in range(0, shape[0], 16):  # in strips: a float copy of all frames has four times their size
         these = np.s_[row : row + 16]
         given = None if empty is None else empty[these]
         mean[these], noise[these] = _statistics(pictures[:, these].astype(np.float32), given, full_scale)
@@ -70,7 +70,7 @@ def measure_background(pictures: NDArray[Any], empty: Levels | None = None) -> B
         quiet = np.abs(pictures[:, ::8, ::8].astype(np.float32) - empty[::8, ::8])
         if len(pictures) >= FEW:
             noise = np.maximum(noise, np.median(_nan_quantile(quiet, MEASURED_SHARE)) / MEASURED_SIGMAS)
-        else:  # here the sphere itself would count as noise
+        else:  # else the sphere counts as noise
             noise = np.full(shape, max(1.4826 * np.median(quiet), _rounding(full_scale)), np.float32)
     return Background(mean=mean, noise=noise, full_scale=full_scale)
 
@@ -84,8 +84,8 @@ def _full_scale(pictures: NDArray[Any]) -> float:
 
 
 def even_scene(background: Background, diameter_px: float) -> Background:
-    """Return a background in which no sphere shows, even one that never leaves its pixels, but no detail either: the
-    median about each pixel, over a few diameters.
+    """Return a background without any sphere, even one that never leaves its pixels, but without detail: the median
+    around each pixel, over a few diameters.
     """
     mean = background.mean
     low, high = float(mean.min()), max(float(mean.max()), float(mean.min()) + 1.0)
@@ -101,9 +101,9 @@ def even_scene(background: Background, diameter_px: float) -> Background:
 
 
 def filled(background: Background, even: Background, covered: Mask, diameter_px: float) -> Background:
-    """Return a background with the even scene where spheres that turn cover pixels in nearly all frames (n, H, W)."""
+    """Return a background with the even scene where rotating spheres cover pixels in nearly all frames (n, H, W)."""
     loud = (background.noise > LOUD * background.typical_noise).astype(np.float32)
-    changes = cv2.blur(loud, (int(diameter_px / 2) | 1,) * 2) > CHANGING  # what stands still belongs to the scene
+    changes = cv2.blur(loud, (int(diameter_px / 2) | 1,) * 2) > CHANGING  # pixels without change belong to the scene
     never = (len(covered) - covered.sum(0) < FREE) & changes
     mean, noise = (
         np.where(never, getattr(even, part), getattr(background, part)).astype(np.float32) for part in ("mean", "noise")
@@ -112,7 +112,7 @@ def filled(background: Background, even: Background, covered: Mask, diameter_px:
 
 
 def without_ball(background: Background, pictures: NDArray[Any], covered: Mask) -> Background:
-    """Measure the pixels `covered` (n, H, W) again from the other frames; with under `FREE` they keep their values."""
+    """Measure the pixels `covered` (n, H, W) again from the other frames, if there are at least `FREE`."""
     free = len(pictures) - covered.sum(axis=0)
     again = (free < len(pictures)) & (free >= FREE)
     values = pictures[:, again].astype(np.float32)
@@ -149,11 +149,11 @@ def _nan_quantile(values: Levels, share: float) -> Levels:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Frame:
-    """Picture of one camera at one instant; made by `screened_frames`."""
+    """Picture of one camera at one instant."""
 
     shown: Shown  # (H, W); zeros if missing
     read: Reason = Reason.OK  # OK, MISSING, UNDECODABLE, or REPEATED: equal to the frame before
-    background: Background | None = None  # of the empty scene, by which it is dark or white; None: it is not
+    background: Background | None = None  # of the empty scene, to test for dark or white; None: no test
 
     @cached_property
     def picture(self) -> Picture:
@@ -162,7 +162,7 @@ class Frame:
 
     @cached_property
     def reason(self) -> Reason:
-        """OK, or why it cannot be used: as `read`, or `DARK` (no light) or `SATURATED` (white) by the whole picture."""
+        """OK, or why it cannot be used: as `read`, or `DARK` (no light) or `SATURATED` (white)."""
         if self.background is None or self.read in (Reason.MISSING, Reason.UNDECODABLE):
             return self.read
         return dark_or_white(self.picture, self.background) or self.read
@@ -174,12 +174,12 @@ class Frame:
 
     @property
     def readable(self) -> bool:
-        """Whether there is a new picture, by which `usable` is not told yet."""
+        """Whether there is a new picture; `usable` also tests its light."""
         return self.read is Reason.OK
 
 
 def dark_or_white(picture: Picture, background: Background) -> Reason | None:
-    """Return `DARK` (no light) or `SATURATED` (white) of a picture (H, W) that shows nothing; None of others."""
+    """Return `DARK` (no light) or `SATURATED` (white) for a picture (H, W) without information; else None."""
     some = picture[::EVERY, ::EVERY]
     empty = background.mean[::EVERY, ::EVERY]
     if uniform(picture):
@@ -193,7 +193,7 @@ def dark_or_white(picture: Picture, background: Background) -> Reason | None:
 
 
 def screened(picture: Shown, before: Shown | None, background: Background) -> Frame:
-    """Return the frame of a picture (H, W) that was read after another one."""
+    """Return the frame of a picture (H, W) that follows another one."""
     read = Reason.REPEATED if equal(picture, before) else Reason.OK
     return Frame(shown=picture, read=read, background=background)
 
@@ -202,7 +202,7 @@ def screened_frames(
     stream: CameraStream, background: Background, first: int = 0, last: int | None = None, pool: Executor | None = None
 ) -> Iterator[Frame]:
     """Yield frames first .. last - 1 from the first in use; reasons depend on this and the previous frame only.
-    With a `pool` movies that allow it are decoded there, part by part, as fits ask for it.
+    With a `pool`, movies that allow it are decoded there, in the parts that fits need.
     """
     lead = min(first, 1)
     blank = np.zeros(stream.movie.frame_shape, stream.movie.dtype)

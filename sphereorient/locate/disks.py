@@ -1,4 +1,4 @@
-"""All disks of a picture that may be spheres: partly hidden ones and those cut by the border, too."""
+"""All disks of a picture that may be spheres, also partly hidden ones and those cut by the border."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -23,24 +23,24 @@ from sphereorient.locate.outline import (
 )
 from sphereorient.locate.settings import LocateSettings
 
-STEP_PX = 2.5  # between the radii for which edges vote, about the scatter of the votes of one rim
-SCATTER_PX = 2.0  # Gaussian by which votes are joined
+STEP_PX = 2.5  # step of the radii of votes, about the scatter of votes of one rim
+SCATTER_PX = 2.0  # Gaussian that joins votes
 SHRINK = 2  # votes are counted on a picture reduced by this factor
-DEPTH = 0.5  # of the setting `diameter_tolerance`: largest deviation of a radius that is voted for
+DEPTH = 0.5  # of the setting `diameter_tolerance`: largest deviation of a voted radius
 LEAST_VOTES = 0.08  # share of a rim that must vote for its middle
-PEAK, MOST = 5, 80  # reduced px within which the best middle of a radius counts; circles that are looked at
+PEAK, MOST = 5, 80  # reduced px: distance of separate middles of one radius; most examined circles
 VOTED_PX = 2.5  # error of a voted circle
-USUAL = 0.75  # of this deviation: circles of paint are usually further from the expected radius than rims
+USUAL = 0.75  # of this deviation: circles of paint are usually farther from the expected radius than rims
 LEAST_RIM = 0.2  # share of all directions with an edge on the rim, less half of those with one just outside
 LEAST_BESIDE = 0.15  # share of the pixels about an edge that differ from the background
-HALO, LEAST_NEW = 1.05, 0.06  # of the radius; share of a disk that lies in no disk of more rim
+HALO, LEAST_NEW = 1.05, 0.06  # of the radius; least share of a disk outside all disks with more rim
 LEAST_FULL = 0.35  # share of a disk that differs from the background
-ALONE = 0.5  # of the radius: of two middles that are nearer the one with more votes counts
-FURTHER = 4  # more disks than spheres: other round things, and circles that fit a texture
+ALONE = 0.5  # of the radius: of two nearer middles, the one with more votes is kept
+FURTHER = 4  # more disks than spheres: other round objects, and circles in the texture
 RADIAL = 0.85  # cosine of the angle between an edge's gradient and the radius
-NEAR = (0.15, 0.15, 0.1, 0.1)  # of the radius, round by round: edges that far from the circle are looked at
-PAINT_SHARE = 0.04  # of the radius: error of a middle where black paint hides the rim
-RADIUS_SIGMA = 0.06  # relative, of the voted radius: steadies a circle of which a short arc shows
+NEAR = (0.15, 0.15, 0.1, 0.1)  # of the radius, by round: largest distance of used edges from the circle
+PAINT_SHARE = 0.04  # of the radius: error of a middle if black paint hides the rim
+RADIUS_SIGMA = 0.06  # relative error of the voted radius: stabilises circles with a short arc
 TUKEY, LEAST_SCALE_PX, FEWEST = 3.0, 0.3, 8
 
 Points = NDArray[np.float64]
@@ -50,10 +50,10 @@ Circle = NDArray[np.float64]  # (3,): u, v, radius, px
 def find_disks(
     picture: NDArray[np.generic], background: Background, diameters_px: Sequence[float], settings: LocateSettings
 ) -> list[Outline]:
-    """Return the disks in a picture (H, W) of about the expected diameters, px, one a sphere; most rim first.
-    Every edge votes for the middles of disks of which it may be the rim: along the inward gradient, one radius away.
-    `rms_px` is the standard error of the middle, which is larger where only an arc of the rim shows; `coverage` the
-    share of all directions with an edge on the rim. There may be more disks than spheres.
+    """Return the disks in a picture (H, W) of about the expected diameters, px, one per sphere; most rim first.
+    Every edge votes for the middles of disks with this edge on the rim: along the inward gradient, one radius away.
+    `rms_px` is the standard error of the middle, larger for a short arc; `coverage` the share of all directions with an
+    edge on the rim. There may be more disks than spheres.
     """
     difference = background.difference(picture)
     noise = background.typical_noise
@@ -71,7 +71,7 @@ def find_disks(
     circles = _voted(edges, picture.shape, diameters_px, tolerance)
     circles = circles[_square_share(full, background.shown, circles) > LEAST_FULL]
     found: list[Outline] = []
-    rest = full.copy()  # without the disks found
+    rest = full.copy()  # without the found disks
     while len(circles) and len(found) < len(diameters_px) + FURTHER:
         merit = _usual(circles[:, 2], diameters_px, tolerance) * support(circles, edges, VOTED_PX) / DIRECTIONS
         best = int(merit.argmax())
@@ -83,7 +83,7 @@ def find_disks(
         if fit is not None and filled[0] > LEAST_FULL and filled[1] > LEAST_NEW:
             found.append(fit)
             cover(rest, fit, HALO, 0)
-            # A rim belongs to one disk.
+            # Each rim belongs to one disk.
             edges = edges.where(np.abs(np.linalg.norm(edges.point - circle[:2], axis=1) - circle[2]) > VOTED_PX)
         away = np.linalg.norm(circles[:, :2] - circle[:2], axis=1) > ALONE * circle[2]
         away[best] = False
@@ -92,7 +92,7 @@ def find_disks(
 
 
 def _voted(edges: Edges, shape: tuple[int, ...], diameters_px: Sequence[float], tolerance: float) -> Points:
-    """Return the circles (n, 3: u, v, r) with most votes, most first; middles may lie outside of the picture."""
+    """Return the circles (n, 3: u, v, r) with most votes, most first; middles may lie outside the picture."""
     radii = _radii(diameters_px, tolerance)
     margin = int(max(radii) / SHRINK) + 1
     height, width = (side // SHRINK + 1 + 2 * margin for side in shape)
@@ -114,13 +114,13 @@ def _voted(edges: Edges, shape: tuple[int, ...], diameters_px: Sequence[float], 
 
 
 def _usual(radius: Points, diameters_px: Sequence[float], tolerance: float) -> Points:
-    """Return a weight (n,) of radii, px: 1 of the expected ones, less of those that only part of the paint may have."""
+    """Return a weight (n,) of radii, px: 1 for the expected ones, less for those likely to be circles of paint."""
     off = np.abs(2 * radius[:, None] / np.asarray(diameters_px) - 1).min(1)
     return np.asarray(np.exp(-0.5 * (off / (USUAL * tolerance)) ** 2))
 
 
 def _radii(diameters_px: Sequence[float], tolerance: float) -> list[float]:
-    """Return the radii, px, for which edges vote: those expected, and others by the tolerance, in even steps."""
+    """Return the radii, px, of votes: the expected ones, and others within the tolerance, in even steps."""
     radii: list[float] = []
     for diameter in sorted(set(diameters_px)):
         low, high = diameter / 2 * (1 - tolerance), diameter / 2 * (1 + tolerance)
@@ -130,7 +130,7 @@ def _radii(diameters_px: Sequence[float], tolerance: float) -> list[float]:
 
 
 def _fitted(edges: Edges, voted: Circle, least_px: float) -> Outline | None:
-    """Return the circle through the edges about a voted one, by least squares with Tukey's weights."""
+    """Return the circle through the edges near a voted one, by least squares with Tukey's weights."""
     circle = voted.copy()
     edges = edges.where(np.abs(edges.point - circle[:2]).max(1) < (1 + 2 * NEAR[0]) * circle[2])
     for near in NEAR:
@@ -166,7 +166,7 @@ def _fitted(edges: Edges, voted: Circle, least_px: float) -> Outline | None:
 
 
 def _outermost(outward: Points, offset: Points) -> NDArray[np.int64]:
-    """Return the index of the outermost edge of each direction that has one: the paint's own edges lie further in."""
+    """Return the index of the outermost edge of each direction that has one, as edges of the paint lie inside."""
     direction = direction_bins(*outward.T)
     order = np.lexsort((offset, direction))
     last = np.append(direction[order][1:] != direction[order][:-1], True)
@@ -201,7 +201,7 @@ def _full_share(full: NDArray[np.uint8], shown: NDArray[np.bool_] | None, circle
 
 
 def cover(mask: NDArray[Any], disk: Outline, share: float, value: int) -> None:
-    """Set a mask (H, W) to a value inside a disk of `share` times the radius, and a pixel more."""
+    """Set a mask (H, W) to a value inside a disk of `share` times the radius plus a pixel."""
     reach = share * disk.radius_px + 1
     left, top = max(0, int(disk.u_px - reach)), max(0, int(disk.v_px - reach))
     window = mask[top : max(0, int(disk.v_px + reach) + 2), left : max(0, int(disk.u_px + reach) + 2)]

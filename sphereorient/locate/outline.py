@@ -15,23 +15,23 @@ Mask = NDArray[np.bool_]
 
 DIRECTIONS = 72  # bins of 5 degrees for a circle's support
 BEYOND = 1.0  # weight of a rim point outside a circle relative to one on it
-NOISE_FLOOR = 2.0  # the root is linear below this many sigmas: noise is not amplified
+NOISE_FLOOR = 2.0  # sigmas below which the root is linear, not to amplify noise
 NOISE_STEEPNESS = 0.28  # times root noise: steepness of stabilised noise at one pixel in 10^4
 LEAST_RIM = 0.25  # least denominator of the coverage, share of all directions
-NEAR_HIDDEN_PX = 3  # edges this near to the mask do not belong to the rim
+NEAR_HIDDEN_PX = 3  # edges this near the mask do not belong to the rim
 PAINTED = 0.15  # least variance of the sphere, share of the window's largest
 BESIDE, NEAR_RIM = 0.1, 1.1  # most foreground beside the sphere, share of the disk; radii: halo
 SET_ASIDE = 2  # other round objects whose rims are removed
-THIN = 0.6  # of the least coverage: support of a circle below which it has no rim. Balls: 1.2 or more; blades: 0.4
-# Largest rms of a circle: of the tolerance times the squared coverage; a short arc counts as this coverage once.
+THIN = 0.6  # of the least coverage: least support of a rim. Balls have 1.2 or more, blades 0.4
+# Largest rms of a circle: in tolerances times squared coverage; least coverage in this product.
 ROUGH, SHORT = 1.5, 4 / 9
-PROFILES = 180  # radial profiles; more sample the same pixels again
+PROFILES = 180  # radial profiles; more would sample the same pixels
 ALL_AROUND = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Blob:
-    """Approximate position of the sphere; made by `find_blobs`."""
+    """Approximate position of the sphere."""
 
     u_px: float
     v_px: float
@@ -53,7 +53,7 @@ def find_blobs(difference: Levels, noise: Levels, diameter_px: float, settings: 
     """
     factor = settings.reduction
     small = np.maximum(coarser(difference - settings.noise_factor * noise, factor), 0)
-    # Clip near the sphere's brightness: a bright reflection must not dominate.
+    # Clip near the sphere's brightness, against bright reflections.
     lit = small[small > 0]
     if lit.size == 0:
         return []
@@ -98,7 +98,7 @@ def _judge(small: Levels, u: float, v: float, radius: float) -> tuple[float, flo
 
 @dataclass(frozen=True, kw_only=True)
 class Outline:
-    """Circle fitted to the limb; made by `fit_outline`."""
+    """Circle fitted to the limb."""
 
     u_px: float
     v_px: float
@@ -106,7 +106,7 @@ class Outline:
     rms_px: float  # distance of supporting edges from the circle
     coverage: float  # share of the visible directions with a supporting edge
     spread: tuple[tuple[float, ...], ...] = ALL_AROUND  # covariance of (u, v, radius), (3, 3), over rms_px^2
-    stretch: float = math.nan  # by how much it is wider than high, relative
+    stretch: float = math.nan  # relative excess of width over height
     painted: bool = True  # more than one grey inside
 
     @property
@@ -143,18 +143,18 @@ def edge_points(window: Levels, steepness: float) -> Edges:
 
 
 def window_about(u: float, v: float, reach: int) -> tuple[slice, slice]:
-    """Return the rows and columns of a picture within `reach` of a place, px."""
+    """Return the rows and columns of a picture within `reach` of a point, px."""
     rows, columns = (slice(max(0, int(at) - reach), max(0, int(at) + reach + 1)) for at in (v, u))
     return rows, columns
 
 
 def direction_bins(across: Floats, down: Floats) -> NDArray[np.int64]:
-    """Return in which of `DIRECTIONS` bins vectors point, (n,)."""
+    """Return the bins, of `DIRECTIONS`, of the directions of vectors, (n,)."""
     return ((np.arctan2(down, across) + np.pi) * (DIRECTIONS / (2 * np.pi))).astype(int) % DIRECTIONS
 
 
 def stabilised(difference: Levels, noise: float, settings: LocateSettings) -> Levels:
-    """Return the root of a blurred difference: the variance of shot noise is even, dim and bright rims count alike."""
+    """Return the root of a blurred difference: shot noise becomes uniform, and dim and bright rims count equally."""
     lift = NOISE_FLOOR * noise
     blurred = cv2.GaussianBlur(difference, (0, 0), settings.edge_blur_px)
     return np.asarray(np.sqrt(blurred + lift) - np.float32(np.sqrt(lift)), np.float32)
@@ -168,7 +168,7 @@ def least_steepness(contrast: float, noise: float, settings: LocateSettings) -> 
 
 
 def away_from_hidden(shown: Mask | None, shape: tuple[int, ...]) -> Mask:
-    """Return where in a picture, or a window, edges are not those of a mask, (H, W)."""
+    """Return where in a picture, or a window, edges are not due to a mask, (H, W)."""
     if shown is None:
         return np.ones(shape, bool)
     square = np.ones((2 * NEAR_HIDDEN_PX + 1,) * 2, np.uint8)
@@ -204,7 +204,7 @@ def support(circles: Floats, edges: Edges, tolerance: float) -> Floats:
     across, down = (edges.point[:, k] - circles[:, k : k + 1] for k in (0, 1))
     distance = np.sqrt(across**2 + down**2)
     offset = distance - circles[:, 2:3]
-    # Most edges lie far from most circles.
+    # Most edges are far from most circles.
     near = (offset > -tolerance) & (offset < np.maximum(0.25 * circles[:, 2:3], tolerance))
     circle, edge = np.nonzero(near)
     across, down, distance, offset = (part[near] for part in (across, down, distance, offset))
@@ -219,7 +219,7 @@ def support(circles: Floats, edges: Edges, tolerance: float) -> Floats:
 
 
 def _painted(window: Levels, circle: Floats) -> bool:
-    """Return whether the variance inside a circle is near the window's largest: objects of one colour have less."""
+    """Return whether the variance inside a circle is near the window's largest; objects of one colour have less."""
     side = max(3, round(2**0.5 * circle[2]) | 1)
     mean, square = (
         cv2.boxFilter(part, -1, (side, side), borderType=cv2.BORDER_REPLICATE) for part in (window, window**2)
@@ -231,7 +231,7 @@ def _painted(window: Levels, circle: Floats) -> bool:
 
 
 def _alone(window: Levels, circle: Floats) -> bool:
-    """Return whether there is no foreground outside a circle, which then may be a sphere of one colour."""
+    """Return whether there is no foreground outside a circle, so that it may be a sphere of one colour."""
     row, column = np.ogrid[: window.shape[0], : window.shape[1]]
     away = np.hypot(row - circle[1], column - circle[0]) / circle[2]
     inside = away < 1
@@ -249,7 +249,7 @@ def _best_circle(edges: Edges, radius_range: tuple[float, float], tolerance: flo
     circles = circles[good]
     if not len(circles):
         return None
-    # Cheap test first: all three edges must fall outwards.
+    # Quick test first: all three edges must fall outwards.
     away = edges.point[choice[good]] - circles[:, None, :2]
     outwards = -(away * edges.inward[choice[good]]).sum(2) / circles[:, 2:3] > 0.8
     circles = circles[outwards.all(1)][:tries]
@@ -262,7 +262,7 @@ def _best_circle(edges: Edges, radius_range: tuple[float, float], tolerance: flo
 def _ball_circle(
     edges: Edges, window: Levels, radius_range: tuple[float, float], tolerance: float
 ) -> tuple[Floats | None, bool]:
-    """Return the best circle that may be the sphere, and whether it is painted; remove rims of other objects."""
+    """Return the best circle that may be the sphere, and whether it is painted; rims of other objects are removed."""
     for _ in range(SET_ASIDE + 1):
         circle = _best_circle(edges, radius_range, tolerance)
         painted = circle is not None and _painted(window, circle)
@@ -286,7 +286,7 @@ def _radial_edges(
     right, down = at.astype(np.float32).transpose(2, 0, 1)
     profile = cv2.remap(window, right, down, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     fall = np.asarray(cv2.blur(profile[:, :-2] - profile[:, 2:], (3, 1)) / (2 * step), np.float32)
-    # Maximum within 1 px: interpolation ripples the tail of the blurred rim.
+    # Maximum within 1 px, against ripples by interpolation in the tail of the blurred rim.
     peak = (fall >= cv2.dilate(fall, np.ones((1, 5), np.uint8))) & (fall > steepness)
     peak[:, [0, -1]] = False
     last = peak.shape[1] - 1 - peak[:, ::-1].argmax(1)
@@ -302,7 +302,7 @@ def _radial_edges(
 
 
 def _consensus(outward: Floats, offset: Floats, trust: Floats, tolerance: float) -> Floats:
-    """Return the shift (du, dv, dr) with most support: outliers lie inside, so that means and medians are biased."""
+    """Return the shift (du, dv, dr) with most support; as outliers lie inside, means and medians are biased."""
     design = np.column_stack([outward, np.ones(len(outward))])
     choice = np.random.default_rng(0).integers(0, len(offset), (300, 3))
     triple = design[choice]
@@ -311,7 +311,7 @@ def _consensus(outward: Floats, offset: Floats, trust: Floats, tolerance: float)
         return np.zeros(3)
     moves = np.linalg.solve(triple[solvable], offset[choice[solvable]][..., None])[..., 0]
     residual = offset - moves @ design.T
-    # The sphere ends at its rim: points outside weigh more than points on it.
+    # The sphere ends at its rim: points outside have more weight than points on it.
     merit = (np.abs(residual) < tolerance) @ trust - BEYOND * ((residual > 2 * tolerance) @ trust)
     best: Floats = moves[int(merit.argmax())]
     return best
@@ -322,7 +322,7 @@ def _fit_circle(window: Levels, circle: Floats, tolerance: float, steepness: flo
         outward, offset, fall = _radial_edges(window, circle, reach, steepness, clear)
         if len(offset) < 12:
             return None
-        # Weak falls are often the halo of a texture patch.
+        # Weak falls are often halos of texture patches.
         trust = np.minimum(fall / np.percentile(fall, 75), 1.0)
         design = np.column_stack([outward, np.ones(len(outward))])
         move = _consensus(outward, offset, trust, 0.4 * tolerance)
@@ -338,7 +338,7 @@ def _fit_circle(window: Levels, circle: Floats, tolerance: float, steepness: flo
             residual = offset - design @ move
         circle = circle + move
     used = weight > 0
-    # Light, paint and blur move neighbouring edges together: more of them do not help, but an arc tells less.
+    # Light, paint and blur shift neighbouring edges together: more edges do not help, but a longer arc does.
     information = 2 / PROFILES * design[used].T @ design[used]
     ellipse = np.column_stack([design, outward[:, 0] ** 2 - outward[:, 1] ** 2, 2 * outward[:, 0] * outward[:, 1]])
     wider = np.linalg.lstsq(ellipse * root[:, None], offset * root, rcond=None)[0][3]
@@ -363,8 +363,8 @@ def fit_outline(
     settings: LocateSettings,
     shown: Mask | None = None,
 ) -> Outline | None:
-    """Return the outline near a blob, picture px; None if no circle of an allowed size is supported. The fewer edges
-    support a circle, the better they must fit: those of paint and of glints at the border scatter.
+    """Return the outline near a blob, picture px; None if no circle of an allowed size is supported. Fewer supporting
+    edges must fit better, as edges of paint and of glints at the border scatter.
     `difference` (H, W) is |frame - background| and `noise` its sigma, grey levels; `shown` (H, W) is False where
     something hides the sphere. Robust to texture edges, bubbles and black paint on a dark background.
     Source: paper section III A (Canny edges, circle fit); the robust part is ours.

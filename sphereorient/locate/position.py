@@ -1,5 +1,5 @@
-"""Where spheres are in the lab: positions from two rays or more, or from one ray and the radius; and the disks of
-several cameras that may show one sphere, because their lines of sight meet.
+"""Positions of spheres in the lab, from two rays or more, or from one ray and the radius; and the matching of disks of
+several cameras whose lines of sight meet.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,12 +20,12 @@ from sphereorient.locate.sightings import Sightings, sightings_of
 NOT_MEASURED = int(Flag.POSITION_INTERPOLATED | Flag.POSITION_OUTLIER_REPLACED)
 Numbers = NDArray[np.int64]
 Floats = NDArray[np.float64]
-MISSED = 1e-4  # share of right matches that may be lost
+MISSED = 1e-4  # allowed share of lost right matches
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Positions:
-    """Sphere centres in N frames; made by `find_positions`."""
+    """Sphere centres in N frames."""
 
     position_lab_mm: Tensor  # (N, 3), NaN without a centre
     covariance_mm2: Tensor  # (N, 3, 3), NaN if not measured
@@ -33,13 +33,13 @@ class Positions:
     flags: Tensor
 
     def for_motion(self) -> Tensor:
-        """Return positions from several rays, or all without any, (N, 3), mm; a mixture would look like motion."""
+        """Return positions from several rays, (N, 3), mm, or all without any; a mixture would appear as motion."""
         several = torch.isfinite(self.gap_mm)
         return torch.where(several[:, None] | ~several.any(), self.position_lab_mm, torch.nan)
 
     @property
     def measured(self) -> Tensor:
-        """Frames whose position comes from their own outlines, (N,) bool."""
+        """Frames with a position from their own outlines, (N,) bool."""
         return torch.isfinite(self.position_lab_mm).all(-1) & ((self.flags & NOT_MEASURED) == 0)
 
 
@@ -47,8 +47,8 @@ def find_positions(
     sightings: Mapping[str, Sightings], cameras: Mapping[str, Camera], diameter_mm: float | None
 ) -> Positions:
     """Return the sphere's positions in N frames from the outlines of the cameras; in radii without a diameter.
-    Lines of sight count by the covariance of the centres. With one outline the distance comes from its radius: flag
-    `ONE_CAMERA`.
+    Lines of sight are weighted by the covariance of the centres. With one outline the distance comes from its radius
+    (flag `ONE_CAMERA`).
 
     Raises:
         ExperimentError: several cameras and an unknown diameter.
@@ -78,22 +78,22 @@ def find_positions(
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _View:
     rays: Rays  # (N), to the centre of the outline
-    from_size_mm: Tensor  # (N, 3), on the ray, at the distance from the radius; of parallel rays anywhere
-    across: Tensor  # (N, 3, 3), information across the ray, of the centre alone, 1/mm^2; 1 px where not measured
-    whole: Tensor  # (N, 3, 3), of centre and radius; NaN of parallel rays
+    from_size_mm: Tensor  # (N, 3), on the ray, at the distance by the radius; arbitrary for parallel rays
+    across: Tensor  # (N, 3, 3), information across the ray by the centre alone, 1/mm^2; of 1 px if not measured
+    whole: Tensor  # (N, 3, 3), by centre and radius; NaN for parallel rays
 
 
 def _view(seen: Sightings, camera: Camera, radius_mm: float) -> _View:
     rays = camera.rays(seen.centre_px)
     rim = torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=seen.centre_px.dtype)
     limb = camera.rays(seen.centre_px[:, None] + rim * seen.radius_px[:, None, None])
-    # Sine of the angle between the rays of centre and limb: exact for small angles.
+    # Sine of the angle between the rays of centre and limb, exact for small angles.
     away = torch.linalg.cross(rays.direction_lab[:, None].expand_as(limb.direction_lab), limb.direction_lab)
     sine = away.norm(dim=-1).mean(1)
-    parallel = sine == 0  # of a telecentric camera: its pictures do not tell the distance, and any will do
+    parallel = sine == 0  # telecentric: pictures do not show the distance, and any value serves
     sine = torch.where(parallel, 1.0, sine)
     distance = radius_mm / sine
-    # Behind a port the rays start apart: subtract this part of the distance.
+    # Behind a port the rays have different origins: subtract this part of the distance.
     begun = torch.linalg.cross(rays.origin_lab_mm[:, None] - limb.origin_lab_mm, limb.direction_lab)
     before = (begun * away).sum(-1).mean(1) / sine.square()
     along = (distance - before)[:, None]
@@ -120,11 +120,11 @@ def _inverse(information: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True)
 class Match:
-    """Disks that may show one sphere, at most one a camera; made by `match_disks`."""
+    """Disks that may show one sphere, at most one per camera."""
 
     chosen: tuple[int, ...]  # C, the disk of each camera by index; -1: none
     disks: tuple[Outline | None, ...]  # C
-    chi2: float  # of the lines of sight about their nearest point; 0 of a single disk
+    chi2: float  # of the lines of sight about their nearest point; 0 for a single disk
 
     @property
     def number(self) -> int:
@@ -132,16 +132,16 @@ class Match:
         return sum(k >= 0 for k in self.chosen)
 
     def shares(self, other: "Match") -> bool:
-        """Return whether a disk is in both."""
+        """Return whether the matches have a disk in common."""
         return any(k == m >= 0 for k, m in zip(self.chosen, other.chosen, strict=True))
 
 
 def match_disks(disks: Sequence[Sequence[Outline]], cameras: Sequence[Camera]) -> list[Match]:
-    """Return all choices of disks of C cameras, of one camera or more, whose lines of sight meet within the errors of
-    the disks; wrong ones are among them. Those of most cameras come first, then those that meet best.
+    """Return all choices of disks, at most one for each of C cameras, whose lines of sight meet within the errors of
+    the disks, wrong ones included. Choices of most cameras come first, then those that meet best.
     """
     chosen = np.full((1, len(disks)), -1)
-    for camera, seen in enumerate(disks):  # what does not meet with some disks does not with more
+    for camera, seen in enumerate(disks):  # disks that do not meet do not with further ones
         more = np.repeat(chosen, len(seen), 0)
         more[:, camera] = np.tile(np.arange(len(seen)), len(chosen))
         chosen = np.concatenate([chosen, more[_misfit(more, disks, cameras) <= _most(more)]])
@@ -159,9 +159,7 @@ def match_disks(disks: Sequence[Sequence[Outline]], cameras: Sequence[Camera]) -
 
 
 def assigned(cost: NDArray[np.float64], matches: Sequence[Match]) -> list[tuple[int, int]]:
-    """Return pairs (ball, match) of the least sum of costs (n, N): each ball at most once, and each disk for at most
-    one ball. Pairs of cost 0 or more are left out.
-    """
+    """Return pairs (ball, match) of least sum of costs (n, N), below 0; each ball and each disk at most once."""
     ball, match = np.nonzero(cost < 0)
     if not len(ball):
         return []
@@ -176,7 +174,7 @@ def assigned(cost: NDArray[np.float64], matches: Sequence[Match]) -> list[tuple[
         bounds=Bounds(0, 1),
         constraints=LinearConstraint(rows, ub=1),
     )
-    assert found.x is not None  # leaving all out is a solution
+    assert found.x is not None  # no pairs at all is a solution
     return [(int(ball[n]), int(match[n])) for n in np.flatnonzero(found.x > 0.5)]
 
 
@@ -190,7 +188,7 @@ def places_of(matches: Sequence[Match], cameras: Mapping[str, Camera], diameter_
 
 
 def _most(chosen: Numbers) -> Floats:
-    """Return the largest chi2 (N,) of a match, by its degrees of freedom."""
+    """Return the largest chi2 (N,) of right matches, by their degrees of freedom."""
     return np.asarray(chdtri(np.maximum(2 * (chosen >= 0).sum(1) - 3, 1), MISSED))
 
 
@@ -198,7 +196,7 @@ def _misfit(chosen: Numbers, disks: Sequence[Sequence[Outline]], cameras: Sequen
     """Return chi2 (N,) of the middles of chosen disks (N, C) about the point nearest to their lines of sight."""
     if len(cameras) == 1 or not len(chosen):
         return np.zeros(len(chosen))
-    nothing = [torch.nan] * 3  # the last row, of index -1
+    nothing = [torch.nan] * 3  # the last row, for index -1
     rows = [
         torch.tensor([*([one.u_px, one.v_px, one.rms_px] for one in seen), nothing], dtype=torch.float64)[index]
         for seen, index in zip(disks, torch.from_numpy(chosen).T, strict=True)

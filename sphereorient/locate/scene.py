@@ -21,23 +21,23 @@ from sphereorient.locate.outline import Blob, Levels, Mask, Outline, fit_outline
 from sphereorient.locate.settings import LocateSettings
 from sphereorient.locate.sightings import find_ball
 
-ROUNDS = 4  # most iterations; most movies need two
-RIM = 1.15  # of the radius: includes halo and shadow
+ROUNDS = 4  # most iterations; usually two suffice
+RIM = 1.15  # of the radius, with halo and shadow
 LOUD_SHARE = 0.1  # share of loud pixels in the disk that triggers `_quieter`
 CHANGE_SIGMAS = 0.6745 * 2**0.5  # median difference of two normal numbers, in sigmas
-CHANGES = 2.5  # times a pixel's typical scatter: texture passes
+CHANGES = 2.5  # times a pixel's typical scatter: moving texture
 RIM_FIXED = 1.06  # of the radius: blur and halo of the rim
-TOGETHER = 8  # frames in a row, of those that are spread, in which a ball that sways is taken as fixed
-INPAINT_PX = 3.0  # about a pixel, whose surroundings it goes on from
-LOOKED_AT = 32  # of these, in which it is then looked for
-ALIKE = 0.4  # of the largest area that changes: another one
-RING = 1.5  # of the radius: its median grey replaces the background behind the sphere
-BORDER = 0.03  # of the shorter side: the border of a photograph shows what is around the sphere
-LARGEST, SMALLEST_PX, SIZES = 1.2, 30.0, 1.4  # of the shorter side; px: paint on a smaller ball is not read; ratio
+TOGETHER = 8  # consecutive frames, of the spread ones, in which a swaying ball counts as fixed
+INPAINT_PX = 3.0  # radius of the surroundings from which a pixel is filled
+LOOKED_AT = 32  # of the spread frames, for the outlines
+ALIKE = 0.4  # of the largest area that changes: least area of another one
+RING = 1.5  # of the radius: ring whose median grey replaces the background behind the sphere
+BORDER = 0.03  # of the shorter side: border of a photograph, which shows the surroundings of the sphere
+LARGEST, SMALLEST_PX, SIZES = 1.2, 30.0, 1.4  # of the shorter side; px, as paint of smaller balls is unreadable; ratio
 
-OUTLINES_MIN = 8  # that can show a scatter
-# A ball is not fixed where its outlines scatter by more than all of these: px, of the radius, and of their own errors.
-GIVEN_PX = 0.5  # error of an outline that is given
+OUTLINES_MIN = 8  # least number for a scatter
+# A ball whose outlines scatter by more than all of these is not fixed: px; of the radius; of their errors.
+GIVEN_PX = 0.5  # error of a given outline
 WANDER_PX, WANDER_SHARE, WANDER_SURE = 1.0, 0.02, 2.0
 
 DiskFinder = Callable[[NDArray[Any], Background], list[Outline]]  # disks in a picture (H, W)
@@ -45,17 +45,17 @@ DiskFinder = Callable[[NDArray[Any], Background], list[Outline]]  # disks in a p
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraScene:
-    """Background and expected diameter, px, of one camera; made by `find_scenes`."""
+    """Background and expected diameter, px, of one camera."""
 
     background: Background
     diameter_px: float
-    merit_min: float = 0.0  # of a blob that may be the sphere; 0: not known
-    response: Response | None = None  # of the camera; None: not known, grey levels count as light
-    outline: Outline | None = None  # of a ball that stays in its place, if it was looked for
+    merit_min: float = 0.0  # least merit of a blob that may be the sphere; 0: unknown
+    response: Response | None = None  # of the camera; None: unknown, grey levels count as light
+    outline: Outline | None = None  # of a fixed ball, if it was searched
 
 
 def known_diameter_px(recording: Recording, stream: CameraStream, settings: LocateSettings) -> float | None:
-    """Return the expected diameter, px; None if only the movie can show it; raise as `expected_diameter_px` does."""
+    """Return the expected diameter, px; None if only the movie can show it; raises as `expected_diameter_px`."""
     experiment = recording.experiment
     if settings.diameter_px is None and (
         recording.photograph or (experiment.sphere.in_place and experiment.diameter_mm is None)
@@ -67,17 +67,17 @@ def known_diameter_px(recording: Recording, stream: CameraStream, settings: Loca
 def find_scenes(
     recording: Recording, stream: CameraStream, count: int, settings: LocateSettings
 ) -> dict[str, CameraScene]:
-    """Return one camera's scene for each sphere, by name, from `count` frames or from the given background: one
-    background, expected diameters of their own.
+    """Return one camera's scene for each sphere, by name, from `count` frames or from the given background: a common
+    background, and a diameter for each.
 
     Raises:
-        CameraError: a single telecentric camera, whose pictures do not tell the depth.
+        CameraError: a single telecentric camera, whose pictures do not show the depth.
         ExperimentError: a sphere declared fixed does not rotate in one place, or none in a photograph.
         SettingsError: unknown diameter.
     """
     if len(recording.streams) == 1 and isinstance(stream.camera, TelecentricCamera):
-        expected, got = "a camera whose pictures tell the depth", "a single telecentric one"
-        do = "write model: pinhole, f_px: 1000 times the ball's diameter in px: a ball that is far, at a vague depth"
+        expected, got = "a camera whose pictures show the depth", "a single telecentric one"
+        do = "write model: pinhole and f_px: 1000 times the ball's diameter in px, for a far ball of uncertain depth"
         raise camera_error(f"camera {stream.name}", expected, got, do)
     each = {name: recording.of(name) for name in recording.experiment.names}
     sizes = {name: known_diameter_px(one, stream, settings) for name, one in each.items()}
@@ -91,7 +91,7 @@ def find_scenes(
         outline, guess = find(stream.spread(settings.background_frames), settings, empty, stream.shown)
         sizes = {name: px or 2 * outline.radius_px for name, px in sizes.items()}
         background, outline = guess if empty is None else None, None if sways else outline
-    known = {name: px for name, px in sizes.items() if px is not None}  # by now each is known
+    known = {name: px for name, px in sizes.items() if px is not None}  # all are known here
     if background is None:
         background = learn_background(stream.spread(count), tuple(known.values()), settings, empty, stream.shown)
     scene = CameraScene(background=background, diameter_px=0.0, response=stream.response, outline=outline)
@@ -129,7 +129,7 @@ def learn_background(
     shown: Mask | None = None,
 ) -> Background:
     """Estimate the background of frames (n, H, W): average, find the spheres, measure their pixels from other frames.
-    `diameter_px` is that of the sphere, or those of all. With `empty` (H, W), a given background, only the noise is
+    `diameter_px`: of the sphere, or of all spheres. With `empty` (H, W), a given background, only the noise is
     measured. `shown` is False where the sphere is hidden.
     """
     sizes = tuple(diameter_px) if isinstance(diameter_px, Sequence) else (diameter_px,)
@@ -139,7 +139,7 @@ def learn_background(
     if empty is not None:
         return _quieter(background, pictures, sizes, find)
     first, before = background, 0
-    if several:  # where spheres dwell, they are the mean, and the noise that hides them
+    if several:  # spheres that stay long determine mean and noise, and hide themselves
         even = even_scene(first, max(sizes))
         covered, _ = _covered(pictures, even, find)
         first = filled(first, even, covered, max(sizes))
@@ -170,7 +170,7 @@ def _quieter(background: Background, pictures: NDArray[Any], sizes: Sequence[flo
 def _only_disk(
     picture: NDArray[Any], background: Background, diameters_px: Sequence[float], settings: LocateSettings
 ) -> list[Outline]:
-    """Return the disk of a single sphere, if it is found."""
+    """Return the disk of a single sphere, if found."""
     outline, _ = find_ball(picture, background, diameters_px[0], settings)
     return [] if outline is None else [outline]
 
@@ -186,7 +186,7 @@ def _covered(pictures: NDArray[Any], background: Background, find: DiskFinder) -
 
 
 def given_outline(circle: tuple[float, float, float]) -> Outline:
-    """Return a circle u, v, radius, px, that people gave as an outline."""
+    """Return a user's circle u, v, radius, px, as an outline."""
     return Outline(u_px=circle[0], v_px=circle[1], radius_px=circle[2], rms_px=GIVEN_PX, coverage=1.0)
 
 
@@ -197,10 +197,9 @@ def fixed_ball(
     shown: Mask | None = None,
     circle: tuple[float, float, float] | None = None,
 ) -> tuple[Outline, Background]:
-    """Find a rotating sphere with a fixed centre in frames (n, H, W): only its pixels change.
-    Return its outline, and the background with a guess behind it.
-    `empty` (H, W) is the scene without the sphere; `shown` (H, W) is False where something hides the sphere; `circle`
-    is the outline u, v, radius, px, where that is given.
+    """Find a rotating sphere with a fixed centre in frames (n, H, W), from the pixels that change.
+    Return its outline, and the background with a guess behind it. `empty` (H, W): the scene without the sphere; `shown`
+    (H, W) is False where something hides the sphere; `circle`: its outline u, v, radius, px, if given.
 
     Raises:
         ExperimentError: nothing round changes.
@@ -215,13 +214,13 @@ def fixed_ball(
         given = given_outline(circle)
         return given, _around(given, Background(mean=middle, noise=scatter, full_scale=full_scale, shown=shown), empty)
     usual = float(np.median(scatter)) + 0.3 * full_scale / 255
-    moved = (cv2.medianBlur(scatter, 5) > CHANGES * usual).astype(np.uint8)  # median filter against single pixels, px
+    moved = (cv2.medianBlur(scatter, 5) > CHANGES * usual).astype(np.uint8)  # median filter, px, against single pixels
     count, labels, stats, centres = cv2.connectedComponentsWithStats(moved, connectivity=8)
     if count < 2:
         raise _none_fixed("nothing that changes")
     largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
     inside = (labels == largest).astype(np.uint8)
-    filled = np.sqrt(inside.sum() / np.pi)  # radius of a disk of as many pixels, some of which may be hidden
+    filled = np.sqrt(inside.sum() / np.pi)  # radius of a disk of equal area; some of it may be hidden
     around = filled if shown is None else cv2.minEnclosingCircle(np.asarray(cv2.findNonZero(inside)))[1]
     guess = locating.diameter_px or 2 * float(around)
     change = np.minimum(scatter, np.percentile(scatter[inside > 0], 30))  # limb without texture
@@ -234,8 +233,8 @@ def fixed_ball(
 
 
 def wander_px(pictures: NDArray[Any], scene: CameraScene, locating: LocateSettings) -> float:
-    """Return by how much the outlines in frames (n, H, W) of a ball taken as fixed scatter, robust sigma; 0 where that
-    is little, or not far more than their edges do.
+    """Return the scatter, robust sigma, of the outlines in frames (n, H, W) of a ball taken as fixed; 0 if small, or
+    explained by the scatter of their edges.
     """
     one = partial(find_ball, background=scene.background, diameter_px=scene.diameter_px, settings=locating)
     seen = [ball for ball, _ in side_by_side(one, pictures) if ball is not None]
@@ -251,11 +250,11 @@ def wander_px(pictures: NDArray[Any], scene: CameraScene, locating: LocateSettin
 def swaying_ball(
     pictures: NDArray[Any], locating: LocateSettings, empty: Levels | None = None, shown: Mask | None = None
 ) -> tuple[Outline, Background]:
-    """Find a rotating sphere that sways, or moves slowly, in frames (n, H, W) in order of time: in a few of them its
-    centre is nearly fixed. Return the median of its outlines, and the background with a guess where it always is.
-    Arguments and errors as those of `fixed_ball`.
+    """Find a rotating sphere that sways, or moves slowly, in frames (n, H, W) in order of time, by taking its centre as
+    fixed in a few of them. Return the median of its outlines, and the background with a guess where it always is.
+    Arguments and errors as in `fixed_ball`.
     """
-    together, seen = TOGETHER, dict[int, Outline]()  # by the frame in the middle of a few
+    together, seen = TOGETHER, dict[int, Outline]()  # by the middle frame of a few
     while 2 * len(seen) * together <= len(pictures):
         if together >= 2 * len(pictures):
             raise _none_fixed("no circle about what changes in a few frames")
@@ -263,7 +262,7 @@ def swaying_ball(
         tried = {int(group[len(group) // 2]): _turning(pictures[group], locating, empty, shown) for group in groups}
         seen, together = {k: one for k, one in tried.items() if one is not None}, 2 * together
     some, middles = range(0, len(pictures), max(1, len(pictures) // LOOKED_AT)), np.array(list(seen))
-    each = [seen[int(middles[np.abs(middles - k).argmin()])] for k in some]  # by the nearest few
+    each = [seen[int(middles[np.abs(middles - k).argmin()])] for k in some]  # by the nearest group
     pictures, size_px = pictures[some], 2 * float(np.median([one.radius_px for one in seen.values()]))
     first, found = replace(measure_background(pictures, empty), shown=shown), 0
     for _ in range(ROUNDS):
@@ -287,7 +286,7 @@ def swaying_ball(
 def _turning(
     pictures: NDArray[Any], locating: LocateSettings, empty: Levels | None, shown: Mask | None
 ) -> Outline | None:
-    """Return the outline of `fixed_ball`; None of a ball that rests, or moves too far in these frames."""
+    """Return the outline of `fixed_ball`; None for a ball that rests, or moves too far in these frames."""
     try:
         return fixed_ball(pictures, locating, empty, shown)[0]
     except ExperimentError:
@@ -295,7 +294,7 @@ def _turning(
 
 
 def _where_always(background: Background, covered: Mask) -> Background:
-    """Return a background that goes on smoothly where a ball covers pixels in nearly all frames."""
+    """Return a background filled smoothly where a ball covers pixels in nearly all frames."""
     always = (len(covered) - covered.sum(0) < FREE).astype(np.uint8)
     noise = np.where(always > 0, np.float32(background.typical_noise), background.noise)
     mean = np.asarray(cv2.inpaint(background.mean, always, INPAINT_PX, cv2.INPAINT_TELEA), np.float32)
@@ -305,8 +304,8 @@ def _where_always(background: Background, covered: Mask) -> Background:
 def still_ball(
     pictures: NDArray[Any], locating: LocateSettings, empty: Levels | None = None, shown: Mask | None = None
 ) -> tuple[Outline, Background]:
-    """Find the sphere in a photograph, (1, H, W), of which it may fill the most, by the grey level of its border.
-    Return its outline, and the background as in `fixed_ball`, which has the other arguments, too.
+    """Find the sphere in a photograph, (1, H, W), which it may fill mostly, by the grey level of the border.
+    Return its outline and background, as `fixed_ball`, with its other arguments.
 
     Raises:
         ExperimentError: nothing round differs from the border.
@@ -332,7 +331,7 @@ def measured_size_px(
     pictures: Sequence[NDArray[Any]] | NDArray[Any], background: Background, settings: LocateSettings, largest: float
 ) -> float | None:
     """Return the diameter, px, whose outlines in pictures (H, W) have the best coverage; None without outlines.
-    `largest`: that is tried first, of the picture's shorter side.
+    `largest`: tried first, of the picture's shorter side.
     """
     searched = largest * min(background.mean.shape)
     best, size = 0.0, None
@@ -340,14 +339,14 @@ def measured_size_px(
         outlines = [find_ball(picture, background, searched, settings)[0] for picture in pictures]
         seen = [outline for outline in outlines if outline is not None]
         merit = sum(outline.coverage for outline in seen)
-        if merit > 1.05 * best:  # circles through paint are smaller than the outline: of equals, take the larger
+        if merit > 1.05 * best:  # circles through paint are smaller than the outline: prefer the larger of equals
             best, size = merit, 2 * float(np.median([outline.radius_px for outline in seen]))
         searched /= SIZES
     return size
 
 
 def _around(outline: Outline, scene: Background, empty: Levels | None) -> Background:
-    """Return a scene with the grey about a ball in place of it, or with that without it, where this is given."""
+    """Return a scene with a ball replaced by the grey around it, or by the scene without it, if given."""
     row, column = np.ogrid[: scene.mean.shape[0], : scene.mean.shape[1]]
     away = np.hypot(row - outline.v_px, column - outline.u_px) / outline.radius_px
     ball, ring = away < RIM_FIXED, (away >= RIM_FIXED) & (away < RING)
@@ -358,7 +357,7 @@ def _around(outline: Outline, scene: Background, empty: Levels | None) -> Backgr
 
 
 def _what_changes(stats: NDArray[Any]) -> str:
-    """Return what the largest connected regions that change are, for people."""
+    """Return a description of the largest connected regions that change."""
     left, top, width, height, area = stats[stats[:, cv2.CC_STAT_AREA].argsort()[::-1]].T
     alike = int((area > ALIKE * area[0]).sum())
     each = [
@@ -370,5 +369,5 @@ def _what_changes(stats: NDArray[Any]) -> str:
 
 
 def _none_fixed(got: str) -> ExperimentError:
-    do = "check sphere.fixed: is one ball in its place, mostly in view, and does it turn? Or set locate.diameter_px"
-    return ExperimentError(refusal("movies", expected="a ball that turns in its place", got=got, do=do))
+    do = "check that one ball rotates in its place, mostly in view (sphere.fixed), or set locate.diameter_px"
+    return ExperimentError(refusal("movies", expected="a ball that rotates in its place", got=got, do=do))

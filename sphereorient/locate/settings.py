@@ -1,6 +1,6 @@
 from pydantic import BaseModel, Field, JsonValue
 
-OF_GAPS: dict[str, JsonValue] = {"methods": ["paper", "map"]}  # the methods that look along the movie of one camera
+OF_GAPS: dict[str, JsonValue] = {"methods": ["paper", "map"]}  # methods that interpolate along the movie of one camera
 
 
 class LocateSettings(BaseModel, frozen=True, extra="forbid"):
@@ -12,7 +12,7 @@ class LocateSettings(BaseModel, frozen=True, extra="forbid"):
         description="evenly spread frames whose mean is the background; more smear a passing sphere out better",
     )
     reduction: int = Field(
-        2, ge=1, le=8, description="blobs are looked for on frames reduced by this whole factor; 2 is fastest per frame"
+        2, ge=1, le=8, description="blobs are found on frames reduced by this whole factor; 2 is fastest per frame"
     )
     diameter_px: float | None = Field(
         None, gt=4, description="expected diameter, px; null takes it from the sphere's diameter and the camera"
@@ -33,19 +33,19 @@ class LocateSettings(BaseModel, frozen=True, extra="forbid"):
         8.0, gt=0, description="faintest ball: 90th percentile of the difference inside it, in 255ths of full scale"
     )
     saturated_share: float = Field(
-        0.5, gt=0, le=1, description="share of saturated pixels in the ball from which on it cannot be read"
+        0.5, gt=0, le=1, description="share of saturated pixels in the ball from which it cannot be read"
     )
     edge_fraction: float = Field(
-        0.2, gt=0, lt=1, description="an edge of the outline is at least this share of the ball's contrast steep"
+        0.2, gt=0, lt=1, description="least steepness of an edge of the outline, as a share of the ball's contrast"
     )
     edge_blur_px: float = Field(
-        0.6, gt=0, description="Gaussian blur before edges are taken, px; tames the paint's grain, more moves corners"
+        0.6, gt=0, description="Gaussian blur before edges are found, px; smooths the paint's grain; more moves corners"
     )
     edge_tolerance_px: float = Field(
-        1.5, gt=0, description="an edge this near to the circle supports it; texture edges lie further inside"
+        1.5, gt=0, description="largest distance of a supporting edge from the circle; texture edges lie farther inside"
     )
     coverage_min: float = Field(
-        0.35, gt=0, lt=1, description="share of the outline's directions that must show an edge; black paint hides some"
+        0.35, gt=0, lt=1, description="least share of the outline's directions with an edge; black paint hides some"
     )
     gap_frames_max: int = Field(
         4, ge=0, description="longest gap that is interpolated, frames; the paper: under 5", json_schema_extra=OF_GAPS

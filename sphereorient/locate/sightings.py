@@ -16,15 +16,15 @@ from sphereorient.locate.outline import Blob, Floats, Levels, Mask, Outline, fin
 from sphereorient.locate.settings import LocateSettings
 
 DEGREE = 3  # of the spline
-FEWEST, BESIDE, OUTLYING = 12, 7, 5.0  # places that are smoothed: least number; frames of a median; deviations from it
-HELD_EVERY = 5  # of these places are held out
-STIFFNESSES = [10.0**k for k in range(-3, 7)]  # weights of the path's bend that are tried, frames^3
+FEWEST, BESIDE, OUTLYING = 12, 7, 5.0  # least number of places; frames of a median; deviations of outliers
+HELD_EVERY = 5  # every n-th place is held out
+STIFFNESSES = [10.0**k for k in range(-3, 7)]  # tried weights of the path's bend, frames^3
 Found = tuple[Outline | None, Reason]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sightings:
-    """Outlines of the sphere in N frames of one camera; NaN where neither found nor interpolated."""
+    """Outlines of the sphere in N frames of one camera; NaN if neither found nor interpolated."""
 
     centre_px: Tensor  # (N, 2) float64, (u, v)
     radius_px: Tensor  # (N,) float64
@@ -85,18 +85,16 @@ def ball_at(
     diameter_px: float,
     settings: LocateSettings,
 ) -> Found:
-    """Return the outline of one of the blobs, best first, of a frame (H, W) and its `difference` from the background;
-    see `find_ball`.
-    """
+    """Return the outline of a blob, best first, of a frame (H, W) and its `difference` from the background."""
     best: Outline | None = None
-    likeliest = (False, 0.0)  # painted and supported ones first, then by coverage
+    likeliest = (False, 0.0)  # painted and supported ones first, then the largest coverage
     for blob in blobs:
         outline = fit_outline(difference, background.typical_noise, blob, diameter_px, settings, background.shown)
         if outline is not None:
             likely = (outline.painted and outline.coverage >= settings.coverage_min, outline.coverage)
             if best is None or likely > likeliest:
                 best, likeliest = outline, likely
-        # Usually the first blob; others are tried only if its rim is incomplete.
+        # Usually the first blob; others only if its rim is incomplete.
         if best is not None and best.painted and best.coverage >= max(settings.coverage_min, 0.5):
             break
     contrast_min = settings.contrast_min * background.full_scale / 255
@@ -158,8 +156,8 @@ def fill_gaps(sightings: Sightings, settings: LocateSettings) -> Sightings:
 
 
 def smoothed(sightings: Sightings, settings: LocateSettings) -> Sightings:
-    """Return the outlines without outliers, smoothed, and short gaps filled, without flags. How smooth the path is, is
-    learnt from it, as what predicts every fifth place best from the others.
+    """Return the outlines without outliers, smoothed, with short gaps filled, without flags. The smoothness is the one
+    that predicts every fifth place best from the others.
     """
     track = np.column_stack([sightings.centre_px.numpy(), sightings.radius_px.numpy()])
     known = np.flatnonzero(np.isfinite(track[:, 2]))
@@ -175,7 +173,7 @@ def smoothed(sightings: Sightings, settings: LocateSettings) -> Sightings:
 
 
 def _likely_path(frame: NDArray[np.int64], value: Floats) -> Callable[..., Floats]:
-    """Return the smoothing spline of values (n, D) at frames (n,) that predicts what is held out best."""
+    """Return the smoothing spline of values (n, D) at frames (n,) that best predicts held-out values."""
     x = frame.astype(float)
 
     def through(some: Mask, stiffness: float) -> Callable[..., Floats]:

@@ -1,4 +1,4 @@
-"""Positions or orientations of a track: estimate the process, reject outliers, smooth every segment."""
+"""Positions or orientations of a track: estimation of the process, outlier rejection, smoothing of each segment."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,27 +10,27 @@ from sphereorient.motion.kalman import Bools, Floats, Prior, SmoothedStates, pri
 from sphereorient.motion.path import DELTA, MEAN, SIZE, SegmentTrack, mahalanobis2
 from sphereorient.motion.settings import SmoothSettings
 
-ITERATIONS = 8  # of Gauss and Newton at most between two rejections; two or three do
-SETTLED = 0.03  # of a measurement's sigma: convergence is quadratic, so the next step is negligible
+ITERATIONS = 8  # most Gauss-Newton steps between rejections; usually two or three suffice
+SETTLED = 0.03  # of a measurement's sigma: after such a step the next one is negligible
 PIECE = 200  # instants of a piece, many times the memory of the motion
-FEWEST = 5  # measurements of a piece
-NEAR = 5  # frames over which a wrong measurement makes others look wrong
-AGAIN = 0.5  # of the limit, below which a measurement is used again; below 1 to avoid oscillation
-FAR_MOVED = 100.0  # sigmas; after a larger move of the reference the estimate is repeated
+FEWEST = 5  # least measurements of a piece
+NEAR = 5  # frames over which a wrong measurement affects the test of others
+AGAIN = 0.5  # of the limit: below it a rejected measurement is used again; less than 1 against oscillation
+FAR_MOVED = 100.0  # sigmas; after a larger displacement of the reference the estimate is repeated
 VALUE, SPEED, CHANGE = slice(0, 3), slice(3, 6), slice(6, 9)  # in `Estimate.covariance`
-POLES = (0.02, 6.0)  # per frame, between which the prior's band is looked for; at 6 each frame has a rate of its own
-UNSURE = 0.5  # standard deviation of the logarithm of the scale beforehand: rates that change at will do not tell it
-# Pole per frame beyond which frames hardly predict each other, as of a ball that an animal turns: its motion counts as
-# error otherwise, and is smoothed away. The stated errors then hold as they are.
+POLES = (0.02, 6.0)  # per frame, limits of the prior's band; at 6 the rates of frames are independent
+UNSURE = 0.5  # prior standard deviation of the log of the scale, which fast changing rates do not determine
+# Pole per frame above which frames hardly predict each other, as for a ball under an animal. There the scale is 1:
+# otherwise the motion counts as error and is smoothed away.
 FORGOTTEN = 1.5
 SPREADS = (1e-3, 1e5)  # of the rate per frame, in sigmas of a measurement
 FREE = 6  # unknowns without a prior: the start of the segment and its constant rate
-FIRST_TRIES = (0.15, 0.45, 1.2)  # poles per frame from the best of which the search starts
+FIRST_TRIES = (0.15, 0.45, 1.2)  # tried poles per frame; the search starts from the best
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessPrior:
-    """The prior of a track's rate and the scale of its sigmas; made by `estimate_process`."""
+    """The prior of a track's rate and the scale of its sigmas."""
 
     prior: Prior  # per frame
     scale: float  # true errors of the measurements over their sigmas
@@ -38,14 +38,14 @@ class ProcessPrior:
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessNoise:
-    """The processes of positions and orientations; made by `smooth_motion`, reused by other runs."""
+    """The processes of positions and orientations, estimated by `smooth_motion`, reusable by other runs."""
 
     place: ProcessPrior | None  # None: too few frames to estimate it
     turn: ProcessPrior | None
-    frame_s: float  # that `ProcessPrior` counts in
+    frame_s: float  # unit of time of `ProcessPrior`
 
     def at(self, frame_s: float) -> list[ProcessPrior | None]:
-        """Return the same of positions and orientations in frames of another duration."""
+        """Return the processes of positions and orientations for another duration of frames."""
         k = frame_s / self.frame_s
         return [
             one and replace(one, prior=Prior(pole=one.prior.pole * k, deviation=one.prior.deviation * k))
@@ -55,13 +55,13 @@ class ProcessNoise:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Estimate:
-    """Smooth motion of one segment at its M instants; NaN where it is unknown."""
+    """Smooth motion of one segment at its M instants; NaN if unknown."""
 
     value: Floats  # (M, 3) or (M, 3, 3)
     rate: Floats  # (M, 3), per frame
     change: Floats  # (M, 3), per frame^2
     covariance: Floats  # (M, 9, 9), of value, rate, change
-    rejected: Bools  # (M,), measurements that were rejected
+    rejected: Bools  # (M,), rejected measurements
 
 
 def estimate(
@@ -71,7 +71,7 @@ def estimate(
     Return the estimates, the ratio of true errors to sigmas of the measurements, and the process.
     """
     if known is None:
-        # pieces of the segments, evenly distributed where there are too many
+        # pieces of the segments, an even selection if there are too many
         starts = [(path, k) for path in paths for k in range(0, len(path.time), PIECE)]
         total, most = sum(len(path.time) for path in paths), settings.learn_frames
         if total > most:
@@ -89,7 +89,7 @@ def estimate(
 def _learnt(pieces: Sequence[SegmentTrack], band: float | None, settings: SmoothSettings) -> ProcessPrior:
     scales = settings.least_scale, settings.most_scale
     learnt = estimate_process(pieces, scales, band)
-    for _ in range(3):  # of estimation
+    for _ in range(3):  # rounds of estimation
         before, (settled, _, moves) = pieces, zip(*(_settled(one, learnt, settings) for one in pieces), strict=True)
         pieces = settled
         judged = any((new.used != old.used).any() for new, old in zip(pieces, before, strict=True))
@@ -102,7 +102,7 @@ def _learnt(pieces: Sequence[SegmentTrack], band: float | None, settings: Smooth
 def _settled(
     path: SegmentTrack, learnt: ProcessPrior, settings: SmoothSettings
 ) -> tuple[SegmentTrack, SmoothedStates, float]:
-    """Return the segment about its smooth states, outliers rejected; the states; the largest move, in sigmas."""
+    """Return the segment about its smooth states, without outliers; the states; the largest displacement, sigmas."""
     scale, limit = learnt.scale, settings.outlier_sigma**2
     path = replace(path, covariance=path.covariance * scale**2)
     farthest, tries, judgements = 0.0, 0, 0
@@ -118,21 +118,21 @@ def _settled(
         if step > SETTLED and tries < ITERATIONS:
             continue
         used = _judged(path, states, limit, settings.outlier_share)
-        # At most 12 rounds of rejection: outliers near each other are found one after the other.
+        # At most 12 rounds of rejection: neighbouring outliers are found one after the other.
         if judgements == 12 or (used == path.used).all():
             return replace(path, covariance=path.covariance / scale**2), states, farthest
         path, tries, judgements = replace(path, used=used), 0, judgements + 1
 
 
 def _judged(path: SegmentTrack, states: SmoothedStates, limit: float, share: float) -> Bools:
-    """Return which measurements are used: outliers are dropped, and those that fit again return."""
+    """Return which measurements are used: outliers are dropped, and restored if they fit again."""
     out = path.seen & ~path.used
     used = path.used.copy()
     if out.any():
         off = path.away()[out]
         whole = path.covariance[out] + states.covariance[out][:, VALUE, VALUE]
         used[out] = mahalanobis2(off, whole) < AGAIN * limit
-    # beyond the limit, and beyond all near them; those near are tested again without them
+    # above the limit and above all near ones, which are tested again without them
     away = states.mahalanobis
     wrong = away > limit
     for k in range(1, min(NEAR, len(away) - 1) + 1):
@@ -144,13 +144,13 @@ def _judged(path: SegmentTrack, states: SmoothedStates, limit: float, share: flo
 
 
 def _smoothed(path: SegmentTrack, learnt: ProcessPrior, settings: SmoothSettings) -> Estimate:
-    """Return a segment's estimate; one measurement has no rate, two have no change of it."""
+    """Return a segment's estimate; one measurement gives no rate, two no change of it."""
     if (count := int(path.used.sum())) < 2:
         return _alone(path)
     settled, states, _ = _settled(path, learnt, settings)
     rate, change = settled.mean + settled.rate[:, 0], settled.rate[:, 1] * settled.pole
     covariance = states.covariance.copy()
-    # slow errors pass the smoother like motion; the estimated noise is the fast rest
+    # slow errors pass the smoother as motion does; the estimated noise is the fast part
     slow = settings.slow_share / (1 - settings.slow_share) * learnt.scale**2
     own = np.where(path.seen[:, None, None], path.covariance, path.sigma**2 * np.eye(3))
     covariance[:, VALUE, VALUE] += slow * own
@@ -172,8 +172,8 @@ def estimate_process(
     paths: Sequence[SegmentTrack], scales: tuple[float, float], band: float | None, before: ProcessPrior | None = None
 ) -> ProcessPrior:
     """Find the most probable prior and factor (within `scales`) on the measurements' sigmas.
-    Paths have at least five measurements each. Of a rate that is forgotten from frame to frame the factor is 1.
-    `band`, cycles per frame, fixes the prior; `before` is a start.
+    Paths have at least five measurements each. For a rate forgotten from frame to frame the factor is 1. `band`, cycles
+    per frame, fixes the prior; `before` is a start.
     Source: Rasmussen and Williams 2006, section 5.4.1, by the innovations; the factor in closed form.
     """
     sigma = float(np.median([path.sigma for path in paths]))

@@ -1,5 +1,5 @@
-"""Rates forward in time, from each measurement and those before it: the smoother's prior with a grid of parameters, a
-Kalman filter for each, of which the likeliest counts.
+"""Rates forward in time, from each measurement and those before it: the smoother's prior, with a Kalman filter for each
+of a grid of parameters; the likeliest is used.
 """
 
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ from sphereorient.motion.smooth import LONGEST_STEP
 
 SPREADS = (0.1, 1.0, 10.0, 100.0, 1000.0)  # of the rate per frame, in sigmas of a measurement
 POLES, DEVIATIONS = np.array([(pole, spread) for pole in FIRST_TRIES for spread in SPREADS]).T  # (K,) each
-UNKNOWN_RATE = 1e4  # sigmas of a measurement per frame: standard deviation of a constant rate of which nothing is known
-FIRST_STEPS = 8  # that show the usual step and the usual covariance
-FEWEST = 3  # measurements in a row, from which the rate is told
-JUDGED = 16  # measurements from which the parameters are known
-REMEMBERED = 300  # measurements over which the likelihood forgets
-MOST_MISFIT = 1e3  # of a measurement: a jump is not remembered for long
-BETTER = 3.0  # log-likelihood by which other parameters must be better
-MOST_STEPS = 10.0  # usual ones; a longer step says nothing of the motion
-TICKS = 128  # of a usual step; times are rounded to them, so that the transitions are few, and kept
+UNKNOWN_RATE = 1e4  # sigmas of a measurement per frame: prior standard deviation of an unknown constant rate
+FIRST_STEPS = 8  # from which the usual step and covariance are learnt
+FEWEST = 3  # consecutive measurements from which a rate is returned
+JUDGED = 16  # measurements from which the parameters are estimated
+REMEMBERED = 300  # memory of the likelihood, measurements
+MOST_MISFIT = 1e3  # of a measurement, to limit the effect of a jump
+BETTER = 3.0  # gain of log-likelihood for a change of parameters
+MOST_STEPS = 10.0  # usual steps; a longer step has no information on the motion
+TICKS = 128  # of a usual step; times are rounded to ticks, so that few transitions are needed and cached
 DELTA, MEAN, RATE, SIZE = 0, 1, 2, 2 + ORDER  # delta from the measurement, the constant rate, w, w' / pole, ...
 ON, BACK = [1, 2, 0], [2, 0, 1]  # a cross b = a[ON] b[BACK] - a[BACK] b[ON]; numpy's takes 30 us
 SCALES = SmoothSettings().least_scale, SmoothSettings().most_scale
@@ -30,7 +30,7 @@ CONTRADICTS = SmoothSettings().outlier_sigma ** 2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rate:
-    """A rate with its standard deviations, (3,) each, lab, per s; NaN where it is not known."""
+    """A rate with its standard deviations, (3,) each, lab, per s; NaN if unknown."""
 
     value: Floats
     sigma: Floats
@@ -40,31 +40,31 @@ UNKNOWN = Rate(value=np.full(3, np.nan), sigma=np.full(3, np.nan))
 
 
 class ForwardRate:
-    """The rate of a position, or of an orientation, at each of its measurements, causally; memory is constant.
+    """The rate of a position, or of an orientation, at each of its measurements, causally, in constant memory.
     The prior is that of `smooth_motion`. Its parameters, in units of the usual step and sigma, and the factor on the
-    sigmas of the measurements are those of highest likelihood of late. The principal axes of the usual covariance have
-    a filter each. A measurement that contradicts the motion so far begins it anew.
+    sigmas of the measurements maximise the recent likelihood. There is a filter for each principal axis of the usual
+    covariance. A measurement that contradicts the motion restarts the filters.
     """
 
     def __init__(self) -> None:
-        self._first: list[tuple[float, Floats]] = []  # steps, s, and covariances, until the usual ones are known
+        self._first: list[tuple[float, Floats]] = []  # steps, s, and covariances, until the usual values are known
         self._frame_s = self._sigma = 0.0
         self._axes = np.eye(3)  # columns, lab
-        self._count = 0  # measurements in a row
-        self._late_s = 0.0  # by which the states are behind the last measurement
+        self._count = 0  # consecutive measurements
+        self._late_s = 0.0  # time of the last measurement less that of the states
         self._x, self._P = np.zeros((len(POLES), 3, SIZE)), np.zeros((len(POLES), 3, SIZE, SIZE))
         self._misfit, self._logs, self._number = np.zeros(len(POLES)), np.zeros(len(POLES)), 0.0
         self._best, self._judged = 0, 0
         self._transitions: dict[int, tuple[Floats, Floats, Floats]] = {}
 
     def restart(self) -> None:
-        """Forget the motion: the next measurement does not follow from those before."""
+        """Forget the motion: the next measurement is independent of those before."""
         self._count = 0
 
     def measured(self, step_s: float, step: Floats, covariance: Floats, turn: Floats | None = None) -> Rate:
-        """Return the rate at a measurement of a covariance (3, 3). It comes `step_s`, s, after the last one, and lies
-        by `step` (3,) from it: of orientations by a rotation vector, rad, lab, and `turn` (3, 3) is its rotation. At
-        the first measurement, also after `restart`, none of the three matters.
+        """Return the rate at a measurement of a covariance (3, 3), `step_s`, s, after the last one. `step` (3,) leads
+        to it from there: for orientations a rotation vector, rad, lab, and `turn` (3, 3) is its rotation. At the first
+        measurement, also after `restart`, these three are not used.
         """
         if not self._frame_s:
             self._look(step_s, covariance)
@@ -79,7 +79,7 @@ class ForwardRate:
         return self._rate() if self._count >= FEWEST and self._judged >= JUDGED else UNKNOWN
 
     def _look(self, step_s: float, covariance: Floats) -> None:
-        """Learn the usual step and covariance."""
+        """Learn usual step and covariance."""
         if self._count and step_s > 0:
             self._first.append((step_s, covariance))
         self._count += 1
@@ -97,12 +97,12 @@ class ForwardRate:
         self._late_s, self._count = 0.0, 1
 
     def _carry(self, length: float, step: Floats, turn: Floats | None) -> None:
-        """Carry the states to the next measurement, `length` usual steps ahead."""
+        """Propagate the states to the next measurement, `length` usual steps ahead."""
         parts = int(np.ceil(length / LONGEST_STEP))
         ticks = max(1, round(length / parts * TICKS))
         self._late_s = (length - parts * ticks / TICKS) * self._frame_s
         if turn is not None:
-            # The rotation vector is not the integral of omega: Magnus' expansion, to third order in the step.
+            # The rotation vector is not the integral of omega: Magnus expansion to third order in the step.
             x = self._x[self._best]
             omega, change = self._axes @ (x[:, MEAN] + x[:, RATE]), POLES[self._best] * self._axes @ x[:, RATE + 1]
             step = step + length**3 / 12 * (omega[ON] * change[BACK] - omega[BACK] * change[ON])
@@ -129,11 +129,11 @@ class ForwardRate:
         return self._transitions[ticks]
 
     def _update(self, variance: Floats) -> None:
-        """Take the measurement, from which delta is counted, and judge the parameters by it."""
+        """Apply the measurement, from which delta is counted, and rate the parameters by it."""
         innovation, spread = -self._x[..., DELTA], self._P[..., DELTA, DELTA] + variance  # (K, 3)
         misfit = (innovation**2 / spread).sum(1)
         self._count += 1
-        if self._count >= FEWEST:  # before, all is free
+        if self._count >= FEWEST:  # before, nothing is determined
             self._judge(misfit, np.log(spread).sum(1))
             if misfit[self._best] > CONTRADICTS * self._scale2()[self._best]:
                 self._begin(variance)
@@ -142,11 +142,11 @@ class ForwardRate:
         gain = row / spread[..., None]
         self._x += gain * innovation[..., None]
         self._P -= gain[..., None] * row[..., None, :]
-        self._P += self._P.mT  # asymmetry from rounding would grow
+        self._P += self._P.mT  # against growing asymmetry by rounding
         self._P *= 0.5
 
     def _judge(self, misfit: Floats, logs: Floats) -> None:
-        """Choose the parameters by the innovations, whose squares and logarithms of determinants are (K,) each."""
+        """Choose the parameters by the innovations: their squares and logarithms of determinants, (K,) each."""
         keep = 1 - 1 / REMEMBERED
         self._misfit = keep * self._misfit + misfit.clip(max=MOST_MISFIT)
         self._logs = keep * self._logs + logs
@@ -158,7 +158,7 @@ class ForwardRate:
             self._best = best
 
     def _scale2(self) -> Floats:
-        """Return the factors on all variances that the likelihood wants, (K,)."""
+        """Return the likeliest factors on all variances, (K,)."""
         low, high = SCALES
         return np.asarray((self._misfit / self._number).clip(low**2, high**2))
 

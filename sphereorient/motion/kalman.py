@@ -1,6 +1,6 @@
-"""Kalman filter and modified Bryson-Frazier smoother: linear in time, no inverse of a covariance of states.
+"""Kalman filter and modified Bryson-Frazier smoother: linear in time, without inverse covariances of states.
 
-`kalman.c` does the same, where it was built, three times faster.
+`kalman.c`, where built, does the same, three times faster.
 """
 
 import ctypes
@@ -16,21 +16,21 @@ from scipy.special import betaln, gammainc
 from sphereorient.files.compiled import compiled, record
 
 ORDER = 10  # poles; on turbulence-like motion 6 loses 20 % in acceleration, 3 loses 80 %, 11 gains 1 %
-NODES = 8  # of Gauss's quadrature over a step; exact for what Taylor's series of a step can show
+NODES = 8  # of Gauss's quadrature over a step; exact for the Taylor series of a step
 
 
 _M = np.diag(np.ones(ORDER - 1), 1)  # d(state)/dt of w, w', ... with all poles at -1
 _M[-1] = [-math.comb(ORDER, k) for k in range(ORDER)]
-# (M + 1) is nilpotent, so that exp(M tau) is exp(-tau) times a polynomial: no matrix exponential is needed
+# (M + 1) is nilpotent: exp(M tau) is exp(-tau) times a polynomial, without a matrix exponential
 _POWERS = np.stack([np.linalg.matrix_power(_M + np.eye(ORDER), k) for k in range(ORDER)])
-_DENSITY = 2 * np.pi / np.exp(betaln(0.5, ORDER - 0.5))  # of the white noise that sustains w of unit variance
+_DENSITY = 2 * np.pi / np.exp(betaln(0.5, ORDER - 0.5))  # of the white noise for w of unit variance
 _AT, _WEIGHT = leggauss(NODES)
 _FACTORIAL = np.array([math.factorial(k) for k in range(ORDER)], dtype=np.float64)
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 SOURCE = Path(__file__).with_suffix("")
 _Chain = record(SOURCE, "Chain")
-EVERY = 64  # states between stored covariances; the smoother computes the others again, to the same bits
+EVERY = 64  # states between stored covariances; the smoother recomputes the others, to the same bits
 
 
 def _stationary() -> Floats:
@@ -76,7 +76,7 @@ class Prior:
     deviation: float  # standard deviation of w by axis, value per frame
 
     def step_noise(self, step: Floats) -> Floats:
-        """Return the covariance of (integral of w, w, w' / pole, ...) that a step adds, (M, ORDER + 1, ORDER + 1)."""
+        """Return the covariance of (integral of w, w, w' / pole, ...) added in a step, (M, ORDER + 1, ORDER + 1)."""
         since, weight = nodes(step * self.pole)
         response = np.concatenate([integral(since)[..., -1:] / self.pole, grown(since)[..., :, -1]], axis=-1)
         strength = self.deviation**2 * _DENSITY
@@ -86,7 +86,7 @@ class Prior:
 def prior_of_band(band: float, noise: float) -> Prior:
     """Return the prior whose spectrum equals white noise of sigma `noise` a frame at the band (cycles per frame)."""
     rate = 2 * np.pi * band
-    pole = 0.75 * rate  # as estimated from turbulence-like motion: the fall begins a little before the band ends
+    pole = 0.75 * rate  # from turbulence-like motion: the spectrum falls a little below the end of the band
     density = _DENSITY / pole * (1 + (rate / pole) ** 2) ** -ORDER  # of w of unit variance at the band
     return Prior(pole=pole, deviation=float(noise * rate / np.sqrt(density)))
 
@@ -103,7 +103,7 @@ class StateSpace:
     grown: Floats  # (kinds, D - 3, D - 3)
     noise: Floats  # (kinds, D, D), covariance added in a step
     start: Floats  # (D, D), covariance of the first state about zero
-    measured: Floats  # (N, 3); anything where not used
+    measured: Floats  # (N, 3); arbitrary if not used
     covariance: Floats  # (N, 3, 3), of the measurements
     used: Bools  # (N,)
 
@@ -116,10 +116,10 @@ class StateSpace:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Filtered:
-    """Estimates from the past, frame by frame; made by `run_filter`."""
+    """Estimates from the past, frame by frame."""
 
     state: Floats  # (N, D), after the frame's own measurement
-    stored: Floats  # (M, D, D), covariance of every EVERY-th state from the first on: all would be most of the memory
+    stored: Floats  # (M, D, D), covariance of every EVERY-th state from the first on, to save memory
     gain: Floats  # (N, D, 3)
     innovation: Floats  # (N, 3)
     inverse: Floats  # (N, 3, 3), inverse covariance of the innovation
@@ -144,7 +144,7 @@ def run_filter(chain: StateSpace) -> Filtered:
         return Filtered(**found, misfit=float(sums[0]), log_determinant=float(sums[1]))
     states, covariances, gains, innovations, inverses = found.values()
     x, P, F = np.zeros(size), chain.start, np.zeros((size, size))
-    for k in range(count):  # a recursion: each frame needs the one before
+    for k in range(count):  # recursive in the frames
         if k:
             F = chain.transition(k - 1, F)
             x = F @ x
@@ -192,7 +192,7 @@ def _covariances(chain: StateSpace, filtered: Filtered, first: int) -> Floats:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SmoothedStates:
-    """Estimates from past and future; made by `smooth`."""
+    """Estimates from past and future."""
 
     state: Floats  # (N, D)
     covariance: Floats  # (N, K, K), of the wanted combinations of each state
@@ -213,7 +213,7 @@ def smooth(chain: StateSpace, filtered: Filtered, wanted: Floats) -> SmoothedSta
         _run(code, "kalman_smooth", chain, **given, wanted=np.ascontiguousarray(wanted), **found)
         return SmoothedStates(state=state, covariance=covariance, mahalanobis=mahalanobis)
     F = np.zeros((size, size))
-    pull, hold = np.zeros(size), np.zeros((size, size))  # gradient and curvature that the future exerts
+    pull, hold = np.zeros(size), np.zeros((size, size))  # gradient and curvature from the future
     for k in range(count - 1, -1, -1):
         if k == count - 1 or k % EVERY == EVERY - 1:
             block = _covariances(chain, filtered, k - k % EVERY)
@@ -235,17 +235,17 @@ def smooth(chain: StateSpace, filtered: Filtered, wanted: Floats) -> SmoothedSta
         if k:
             F = chain.transition(k - 1, F)
             pull, hold = F.T @ pull, F.T @ hold @ F
-            hold = 0.5 * (hold + hold.T)  # asymmetry from rounding would grow
+            hold = 0.5 * (hold + hold.T)  # against growth of asymmetry by rounding
     return SmoothedStates(state=state, covariance=covariance, mahalanobis=mahalanobis)
 
 
 def kalman_library() -> ctypes.CDLL | None:
-    """Return the compiled recursions; None where there are none."""
+    """Return the compiled recursions; None if there are none."""
     return compiled(SOURCE, _Chain)
 
 
 def _run(code: ctypes.CDLL, name: str, chain: StateSpace, **arrays: Floats) -> None:
-    """Call a function of the compiled code on a chain, and on arrays in and out, contiguous ones."""
+    """Call a function of the compiled code on a chain, and on contiguous input and output arrays."""
     given = {key: np.ascontiguousarray(getattr(chain, key)) for key in StateSpace.__dataclass_fields__} | arrays
     numbers = {"count": len(chain.measured), "size": len(chain.start), "every": EVERY}
     numbers["wanted_rows"] = len(arrays.get("wanted", ()))

@@ -45,14 +45,14 @@ def omega_from_orientations(
     check_separations(separations)
     there = R_lab_body.isfinite().all((-1, -2))
     usable, R = usable_separations(there, separations, segment), torch.where(there[..., None, None], R_lab_body, 0.0)
-    # frames that wrap around an end are never used
+    # frames that wrap around an end are not used
     turns = torch.stack([R.roll(-m, -3) @ R.roll(m, -3).mT for m in separations], dim=-3)  # (..., N, S, 3, 3)
     return mean_over_separations(turns, usable, dt_s, separations, min_separations)
 
 
 def to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
     """Return the body components R^T x (..., 3) of vectors in lab components, in the unit of x.
-    It also serves alpha: the derivative of R^T omega_lab is R^T alpha_lab, because omega x omega vanishes.
+    Also for alpha: the derivative of R^T omega_lab is R^T alpha_lab, because omega x omega is 0.
     Source: docs/errata.md E6.
     """
     check_tail("R_lab_body", R_lab_body, 3, 3)
@@ -67,7 +67,7 @@ def usable_separations(there: Tensor, separations: Sequence[int], segment: Tenso
 
 
 def omega_stencil(usable: Tensor, separations: Sequence[int], min_separations: int, dtype: torch.dtype) -> Tensor:
-    """Return the weights (..., N, 2 max(m) + 1), per frame, of orientation errors in omega; NaN where omega is."""
+    """Return the weights (..., N, 2 max(m) + 1), per frame, of orientation errors in omega; NaN where omega is NaN."""
     m = torch.as_tensor(separations, device=usable.device)
     half, weight = max(separations), m.to(dtype) ** 2 * usable
     total = weight.sum(-1, keepdim=True)
@@ -83,7 +83,7 @@ def mean_over_separations(
     """Return the weighted mean omega of S separations and its standard error, (..., N, 3), rad/s.
     `turns` (..., N, S, 3, 3) lead from frame k - m to k + m, lab; those not `usable` (..., N, S) are left out.
     """
-    # a turn that is not used may be half a turn, where log has no gradient
+    # an unused rotation may be by 180 degrees, where log has no gradient
     turns = torch.where(usable[..., None, None], turns, torch.eye(3, dtype=turns.dtype, device=turns.device))
     m = torch.as_tensor(separations, dtype=turns.dtype, device=turns.device)
     omega = so3.log(turns) / (2 * dt_s * m[:, None])  # (..., N, S, 3)
@@ -95,7 +95,7 @@ def mean_over_separations(
     variance = chi2 / ((count - 1).clamp(min=1) * safe_total)
     enough = count >= max(min_separations, 1)
     scattered = enough & (count > 1) & (variance > 0)
-    # the root's gradient at 0 is infinite: without any scatter the answer is 0 by itself
+    # the root's gradient at 0 is infinite; without scatter the result is 0
     alike = torch.where(enough & (count > 1), 0.0, torch.nan)
     error = torch.where(scattered, torch.where(scattered, variance, 1).sqrt(), alike)
     return torch.where(enough, mean, torch.nan), error
@@ -103,7 +103,7 @@ def mean_over_separations(
 
 def kabsch(points_a: Tensor, points_b: Tensor, weights: Tensor | None = None) -> Tensor:
     """Return the rotation (..., 3, 3) from points_a (..., K, 3) onto points_b, any unit, by weighted least squares.
-    Both sets are centred first. It is proper also for mirror images; points on one line leave it undetermined (not
+    Both sets are centred first. It is proper also for mirror images; collinear points leave it undetermined (not
     checked). Weights (..., K) are not negative; None: all equal.
     Source: W. Kabsch, Acta Cryst. A32, 922 (1976); the paper's R_kabsch, its increment T, docs/errata.md E8.
     """
@@ -130,7 +130,7 @@ def omega_from_markers(
     usable = usable_separations(seen.sum(-1) >= FEWEST_POINTS, separations, segment)
     both = torch.stack([seen.roll(-m, -2) & seen.roll(m, -2) for m in separations], dim=-2)  # (..., N, S, K)
     common = both.sum(-1) >= FEWEST_POINTS
-    # equal weights keep the mean defined where the turn is not used
+    # equal weights keep the mean defined for unused rotations
     weights = torch.where(common[..., None], both, True).to(points.dtype)
     before, after = (torch.stack([points.roll(side * m, -3) for m in separations], -3) for side in (1, -1))
     return mean_over_separations(kabsch(before, after, weights), usable & common, dt_s, separations, min_separations)
@@ -138,8 +138,8 @@ def omega_from_markers(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
-    """Smooth poses, velocities and accelerations of N frames, (..., N, 3), matrices (..., N, 3, 3), NaN where unknown.
-    Sigmas and covariances of `measure_motion` are those from white noise, without the low-pass bias, axis by axis.
+    """Smooth poses, velocities and accelerations of N frames, (..., N, 3), matrices (..., N, 3, 3), NaN if unknown.
+    Sigmas and covariances of `measure_motion` are from white noise, without the low-pass bias, axis by axis.
     """
 
     position_lab_mm: Tensor
@@ -161,8 +161,8 @@ class Motion:
 
 
 def datasets_of(found: Motion, length_unit: str = "mm") -> dict[str, Any]:
-    """Return smooth poses, velocity to alpha_body, and the errors of all, under the names of a track and in its units.
-    Lengths of positions in another unit than mm are those of velocities, too.
+    """Return smooth poses, velocity to alpha_body, and the errors of all, under the names and in the units of a track.
+    Positions and velocities are in `length_unit`.
     """
     parts = {name: getattr(found, own).numpy() for name, own in (POSES | FIELDS).items()}
     rates = ("velocity", "acceleration") if length_unit != "mm" else ()
@@ -233,7 +233,7 @@ def _rotation(
     omega, _ = omega_from_orientations(R_lab_body, dt_s, separations, segment=segment, min_separations=fewest)
     slope = _stencil(omega, segment, settings.alpha_sigma_frames, 1, settings)
     alpha = apply(slope, omega) / dt_s
-    # neighbouring omegas share orientations: their noise is not white, that of the orientations is
+    # omegas of neighbours have orientations in common: the orientations' noise is white, theirs is not
     usable = usable_separations(R_lab_body.isfinite().all((-1, -2)), separations, segment)
     turn = omega_stencil(usable, separations, fewest, omega.dtype)
     omega_sigma = propagated_sigma(turn, sigma_rad.to(omega)) / dt_s
@@ -247,7 +247,7 @@ def _stencil(x: Tensor, segment: Tensor, sigma_frames: float, order: Order, sett
 
 
 def _by_axis(sigma: Tensor | None, like: Tensor) -> Tensor:
-    """Return sigma (..., N, 3); one number a frame counts for all three axes, none is NaN."""
+    """Return sigma (..., N, 3); one number per frame is for all three axes; None gives NaN."""
     if sigma is None:
         return torch.full_like(like, torch.nan)
     sigma = sigma.to(like)
@@ -255,9 +255,9 @@ def _by_axis(sigma: Tensor | None, like: Tensor) -> Tensor:
 
 
 def _to_body(R_lab_body: Tensor, x_lab: Tensor) -> Tensor:
-    """Turn to body components where there is an orientation, NaN elsewhere."""
+    """Rotate to body components if there is an orientation, else NaN."""
     there = (R_lab_body.isfinite().all((-1, -2)) & x_lab.isfinite().all(-1))[..., None]
-    # numbers in place of NaN, whose gradient would be NaN
+    # replace NaN, whose gradient is NaN
     R, x = torch.where(there[..., None], R_lab_body, 0.0), torch.where(there, x_lab, 0.0)
     return torch.where(there, to_body(R, x), torch.nan)
 

@@ -28,11 +28,11 @@ from sphereorient.motion.kalman import (
 )
 
 SIZE = 3 * (2 + ORDER)
-UNKNOWN = 100.0  # standard deviation of the start from its reference, in sigmas of a measurement: next to no pull
+UNKNOWN = 100.0  # standard deviation of the start from its reference, in sigmas of a measurement: hardly a constraint
 BY_INSTANT = ("time", "covariance", "seen", "used", "rate", "value", "reference")
-TOGETHER = 1024  # steps computed at once: the nodes of all of them would be most of the memory
-VOTES = 5  # neighbouring turns of which the median is typical
-LEFT_OUT = 6  # frames in a row that the first estimate may leave out
+TOGETHER = 1024  # steps computed at once, to save memory
+VOTES = 5  # neighbouring rotations whose median is typical
+LEFT_OUT = 6  # most consecutive frames left out of the first estimate
 DELTA, MEAN, RATE = slice(0, 3), slice(3, 6), slice(6, SIZE)
 
 
@@ -44,10 +44,10 @@ class SegmentTrack:
     covariance: Floats  # (N, 3, 3), of the measurements
     seen: Bools  # (N,), measured
     used: Bools  # (N,), measured and not rejected
-    unknown_rate: float  # standard deviation of the constant rate from the reference's, next to no pull
+    unknown_rate: float  # standard deviation of the constant rate from the reference's: hardly a constraint
     mean: Floats  # (3,), the reference's constant rate, value per frame
     rate: Floats  # (N, ORDER, 3), the reference's w, w' / pole, ...
-    pole: float  # per frame, that `rate` is scaled by
+    pole: float  # per frame, the scale of `rate`
     value: Floats  # (N, 3) or (N, 3, 3), the measurements
     reference: Floats  # like value
 
@@ -63,7 +63,7 @@ class SegmentTrack:
 
     @classmethod
     def first_guess(cls, time: Floats, value: Floats, seen: Bools) -> tuple[Floats, Floats, Bools]:
-        """Return values, gaps interpolated, and rates (N, 3) per frame, at all instants; the frames trusted (N,)."""
+        """Return values, gaps interpolated, and rates (N, 3) per frame, at all instants; the trusted frames (N,)."""
         frames = np.flatnonzero(seen)
         if len(frames) > 1:
             steps = np.diff(value[frames], axis=0)
@@ -102,7 +102,7 @@ class SegmentTrack:
         return replace(self, reference=reference, mean=self.mean + state[0, MEAN], rate=rate, pole=prior.pole)
 
     def away(self) -> Floats:
-        """Return the measurements as deviations (N, 3) from the reference; 0 where not measured."""
+        """Return the measurements as deviations (N, 3) from the reference; 0 if not measured."""
         seen = self.seen.reshape(-1, *(1,) * (self.value.ndim - 1))
         return self.between(self.reference, np.where(seen, self.value, self.reference))
 
@@ -157,7 +157,7 @@ class SegmentTrack:
         noise = np.zeros((len(lengths), SIZE, SIZE))
         noise[:, keep[:, None], keep] = _by_axis(prior.step_noise(lengths))
         start = np.zeros((SIZE, SIZE))
-        # a weak prior about the reference, which follows the states: it damps a step and leaves no bias at convergence
+        # a weak prior about the reference, which follows the states: it damps steps without bias at convergence
         start[DELTA, DELTA] = (UNKNOWN * self.sigma) ** 2 * view
         start[MEAN, MEAN] = (self.unknown_rate + self.sigma) ** 2 * view
         start[RATE, RATE] = prior.deviation**2 * np.kron(STATIONARY, view)
@@ -171,14 +171,14 @@ def mahalanobis2(off: Floats, covariance: Floats) -> Floats:
 
 
 def _by_axis(blocks: Floats) -> Floats:
-    """Return matrices (M, n, n) of one axis as those of three, (M, 3 n, 3 n)."""
+    """Return matrices (M, n, n) of one axis for all three axes, (M, 3 n, 3 n)."""
     count, size = blocks.shape[:2]
     return np.asarray(np.einsum("mij,ab->miajb", blocks, np.eye(3)).reshape(count, 3 * size, 3 * size))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RotationTrack(SegmentTrack):
-    """Orientations of one segment: the same with R_lab_body (N, 3, 3), steps are rotation vectors, lab."""
+    """Orientations of one segment, R_lab_body (N, 3, 3); steps are rotation vectors, lab."""
 
     @staticmethod
     def between(begin: Floats, end: Floats) -> Floats:
@@ -192,16 +192,16 @@ class RotationTrack(SegmentTrack):
 
     @classmethod
     def first_guess(cls, time: Floats, value: Floats, seen: Bools) -> tuple[Floats, Floats, Bools]:
-        """Return orientations, gaps interpolated along the typical turning, and omega_lab."""
+        """Return orientations, gaps interpolated along the typical rotation, and omega_lab."""
         frames = np.flatnonzero(seen)
         if len(frames) < 2:
             return np.broadcast_to(value[frames[0]], value.shape).copy(), np.zeros((len(time), 3)), seen
         steps = rotvec_between(value[frames[:-1]], value[frames[1:]])
         omega = _typical(time, time[frames], steps)
         gone = np.concatenate([np.eye(3)[None], rotation_of((omega[1:] + omega[:-1]) / 2 * np.diff(time)[:, None])])
-        for k in range(1, len(time)):  # a product in order, compared over short spans only: it need not stay exact
+        for k in range(1, len(time)):  # a running product, compared over short spans only, so that it need not be exact
             gone[k] = gone[k] @ gone[k - 1]
-        still = gone[frames].mT @ value[frames]  # constant where the turning is typical
+        still = gone[frames].mT @ value[frames]  # constant for the typical rotation
         trusted = frames[_consistent(cls.between, still, steps)]
         at = np.interp(np.arange(len(time)), trusted, np.arange(len(trusted)))
         left = np.minimum(at.astype(int), max(len(trusted) - 2, 0))
@@ -209,14 +209,14 @@ class RotationTrack(SegmentTrack):
         before, after = trusted[left], trusted[np.minimum(left + 1, len(trusted) - 1)]
         ahead = gone @ gone[before].mT @ value[before]
         missed = rotvec_between(gone[after] @ gone[before].mT @ value[before], value[after])
-        carried = gone @ gone[after].mT @ rotation_of(missed)  # the correction grows in the frame that turns along
+        carried = gone @ gone[after].mT @ rotation_of(missed)  # the correction grows in the rotating frame
         along = rotvec_between(ahead, carried @ gone[after] @ gone[before].mT @ value[before])
         reference = rotation_of(share[:, None] * along) @ ahead
         reference[trusted] = value[trusted]
         return reference, omega, np.isin(np.arange(len(time)), trusted)
 
     def jumps(self, prior: Prior) -> tuple[Floats, Floats]:
-        """Return the reference's own rotations, exact for any angle, and the jumps."""
+        """Return the rotations of the reference, exact for any angle, and the jumps."""
         step, rate, pole = np.diff(self.time), self.scaled(prior)[:-1], prior.pole
         at, _ = nodes(step)
         to_end = np.concatenate([step[:, None] - at, step[:, None]], axis=1)
@@ -269,15 +269,15 @@ def _typical(time: Floats, seen_time: Floats, steps: Floats) -> Floats:
 
 
 def _around(x: Floats, width: int) -> Floats:
-    """Return the neighbours (n, width, d) of every row (n, d); at the ends all are on one side."""
+    """Return the neighbours (n, width, d) of every row (n, d); at the ends, on one side."""
     width = min(width, len(x))
     first = (np.arange(len(x)) - width // 2).clip(0, len(x) - width)
     return np.asarray(x[first[:, None] + np.arange(width)])
 
 
 def _consistent(between: Callable[[Floats, Floats], Floats], still: Floats, steps: Floats) -> NDArray[np.int64]:
-    """Return the frames that follow from each other, by dynamic programming; leaving out a frame has a cost.
-    `still`: measurements (n, ...) less the typical motion, `between` the steps (m, 3) from some to others.
+    """Return the frames that are consistent with each other, by dynamic programming, with a cost for frames left out.
+    `still`: measurements (n, ...) less the typical motion; `between`: the steps (m, 3) from values to others.
     """
     count = len(still)
     reach = min(LEFT_OUT + 1, count - 1)

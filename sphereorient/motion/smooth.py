@@ -1,4 +1,4 @@
-"""Motion from the precise track: smoothed position and orientation, their derivatives, with sigmas."""
+"""Smoothed position and orientation of the precise track, their derivatives, and sigmas."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -22,31 +22,31 @@ Rows = NDArray[np.int64]
 LONGEST_STEP = 1.5  # typical steps; longer ones are bridged by instants in between
 MOST_BETWEEN = 300  # instants that bridge one long step
 LOST_RAD = 0.5  # an orientation with a larger sigma is discarded
-LAGS = 3  # frames after which an error that remains is one that lasts
-CLIP = 4.0  # sigmas: a wrong frame is no lasting error
-AS_MANY = 20  # pairs of frames that outweigh the share that is assumed
-MOST_LASTING = 0.9  # share of the variance that may last: some noise is left
+LAGS = 3  # frames after which a remaining error is one that lasts
+CLIP = 4.0  # sigmas, so that a wrong frame does not count as an error that lasts
+AS_MANY = 20  # pairs of frames with the weight of the assumed share
+MOST_LASTING = 0.9  # largest share of the variance that lasts: some noise is left
 ON_PATH = 4.0  # sigmas (of three axes) within which a measured position agrees with the smoothed path
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Smoothed(Motion):
-    """Motion of N frames by the smoother, float64; its covariances and sigmas hold what smoothing lost, too."""
+    """Motion of N frames by the smoother, float64; covariances and sigmas include the bias of smoothing."""
 
     R_given_path: Tensor  # (N, 3, 3), each frame's own orientation, given the smoothed path of positions
-    cov_given_path_rad2: Tensor  # (N, 3, 3), its covariance, `orientation_scale` and the path's error included
-    extrapolated: Tensor  # (N,) bool, frames of a segment without a measurement of their own of either kind
+    cov_given_path_rad2: Tensor  # (N, 3, 3), its covariance, with `orientation_scale` and the path's error
+    extrapolated: Tensor  # (N,) bool, frames of a segment without any own measurement
     rejected: Tensor  # (N,) bool, frames with a rejected measurement
-    position_scale: float  # true errors of the measured positions over their sigmas, slow errors included
-    orientation_scale: float  # the same of the orientations
+    position_scale: float  # true errors of the measured positions over their sigmas, with slow errors
+    orientation_scale: float  # the same for orientations
     process: ProcessNoise
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MeasuredPoses:
-    """Measured poses of N frames, what `smooth_motion` smooths."""
+    """Measured poses of N frames, the input of `smooth_motion`."""
 
-    time_s: Tensor  # (N,), increasing within a segment, even or not
+    time_s: Tensor  # (N,), increasing within a segment, not necessarily even
     position_lab_mm: Tensor  # (N, 3), NaN where not measured
     position_cov_mm2: Tensor  # (N, 3, 3)
     R_lab_body: Tensor  # (N, 3, 3), NaN where not measured
@@ -67,16 +67,16 @@ class MeasuredPoses:
 
 
 def off_middle(motion: Motion, exposure_s: float) -> tuple[Tensor, Tensor]:
-    """Return by how much poses in pictures lie off the middle of the exposure: moves (..., N, 3), mm, and turns
-    (..., N, 3), rad, lab; 0 where the accelerations are not known. A picture shows the mean over the exposure, which
-    steady accelerations shift by a twenty-fourth of their product with its square.
+    """Return the deviation of poses in pictures from those in the middle of the exposure: displacements (..., N, 3),
+    mm, and rotations (..., N, 3), rad, lab; 0 for unknown accelerations. A picture shows the mean over the exposure,
+    shifted by a steady acceleration times the squared exposure over 24.
     """
     share = exposure_s**2 / 24
     return 1e3 * share * motion.acceleration_m_s2.nan_to_num(), share * motion.alpha_lab_rad_s2.nan_to_num()
 
 
 def in_middle(smoothed: Smoothed, exposure_s: float) -> tuple[Smoothed, Tensor]:
-    """Return smoothed poses in the middle of the exposure, and by how much they are moved back, (..., N, 3), mm."""
+    """Return smoothed poses in the middle of the exposure, and the subtracted displacement, (..., N, 3), mm."""
     move_mm, turn = off_middle(smoothed, exposure_s)
     back = so3.exp(-turn)
     middle = replace(
@@ -91,10 +91,10 @@ def in_middle(smoothed: Smoothed, exposure_s: float) -> tuple[Smoothed, Tensor]:
 def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: ProcessNoise | None = None) -> Smoothed:
     """Smooth a track, segment by segment, and take its derivatives; the result is on the CPU.
     Velocity and omega_lab are a constant plus a stationary random process, estimated from the whole track unless
-    `known`, with one factor on the sigmas. The errors of a frame's orientation and position go together (`coupling`):
-    orientations are smoothed as they are given the smoothed positions. There is no lag; ends are included, gaps inside
-    a segment filled, outliers rejected. A segment of one measured frame has no derivatives, of two no accelerations; a
-    track too short for the estimation has no derivatives. Raises ShapeError (times that do not increase).
+    `known`, with one factor on the sigmas. Orientations are smoothed conditionally on the smoothed positions, as their
+    errors are correlated (`coupling`). There is no lag; ends are included, gaps inside a segment filled, outliers
+    rejected. A segment of one measured frame has no derivatives, of two no accelerations; a track too short for the
+    estimation has no derivatives. Raises ShapeError (times that do not increase).
     Source: Gaussian-process smoother: Sarkka and Solin 2019, Applied Stochastic Differential Equations, chapter 12; on
     SO(3): Barfoot 2017, State Estimation for Robotics, chapters 7 and 8.
     """
@@ -117,8 +117,8 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
         off, path_cov = out["position_lab_mm"] - X, out["position_cov_mm2"]
         posed = np.flatnonzero(seen_X & seen_R & ~rejected & np.isfinite(off).all(1))
         posed = posed[mahalanobis2(off[posed], X_cov[posed]) < ON_PATH**2]
-        # Paint that shifts in the picture is a turn or a move of the sphere; the limb alone tells them apart, and the
-        # path knows the move better than the limb of one frame.
+        # A shift of paint in the picture is a rotation or a displacement of the sphere. Only the limb separates them,
+        # and the path determines the displacement better than the limb of one frame.
         gain = coupling[posed] @ np.linalg.inv(X_cov[posed])
         R[posed] = rotation_of((gain @ off[posed, :, None])[..., 0]) @ R[posed]
         R_cov[posed] -= gain @ coupling[posed].mT
@@ -128,7 +128,7 @@ def smooth_motion(measured: MeasuredPoses, settings: SmoothSettings, known: Proc
     for rows, at in found:
         _put_turns(out, rows, at, frame_s)
         rejected[rows] |= at.rejected
-    # The path's error lasts: neighbours share it, and frames between them.
+    # The path's error lasts: it is common to neighbours and frames between them.
     shared = np.abs(by_path).sum((1, 2)) > 0
     usual = by_path[shared].mean(0) if shared.any() else np.zeros((3, 3))
     out["orientation_cov_rad2"] += np.where(shared[:, None, None], by_path, usual)
@@ -161,8 +161,8 @@ def _estimates(
     settings: SmoothSettings,
     known: ProcessPrior | None,
 ) -> tuple[list[tuple[Rows, Estimate]], float, ProcessPrior | None]:
-    """Return rows and estimate of each segment, the scale of the sigmas and the process, by positions or orientations:
-    values, covariances, and whether measured, (N, ...) each; `band` in cycles per frame.
+    """Return rows and estimate of each segment, the scale of the sigmas and the process, from positions or
+    orientations: values, covariances, and whether measured, (N, ...) each; `band` in cycles per frame.
     """
     values, covariance, seen = poses
     instants = [_Instants.of(rows, time, seen[rows]) for rows, time in segments if seen[rows].any()]
@@ -172,12 +172,12 @@ def _estimates(
 
 
 def lasting_share(apart: Tensor, covariance: Tensor, segment: Tensor, assumed: float) -> float:
-    """Return the share of the variance of cameras' disagreements that lasts over frames, at least the one assumed.
-    `apart` (N, P, 3): turns between the orientations of P pairs of cameras, covariance (N, P, 3, 3); NaN where missing.
+    """Return the share of the variance of cameras' disagreements that lasts over frames, at least the assumed one.
+    `apart` (N, P, 3): rotations between orientations by P pairs of cameras, covariance (N, P, 3, 3); NaN: missing.
     """
     there = torch.isfinite(apart).all(-1) & torch.isfinite(covariance).all((-1, -2)) & (segment >= 0)[:, None]
     unit = torch.eye(3, dtype=covariance.dtype)
-    # A picture with few pixels left may have no full covariance.
+    # A picture with few used pixels may have no full covariance.
     factor, failed = torch.linalg.cholesky_ex(torch.where(there[..., None, None], covariance, unit))
     there = there & (failed == 0)
     factor = torch.where(there[..., None, None], factor, unit)
@@ -194,7 +194,7 @@ def lasting_share(apart: Tensor, covariance: Tensor, segment: Tensor, assumed: f
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Instants:
-    """Rows of one segment, and its instants: its frames, and more inside long steps."""
+    """Rows of one segment, and its instants: its frames, and others inside long steps."""
 
     rows: Rows  # (n,), of the track
     frames: Rows  # (n,), which of the instants are frames
@@ -212,7 +212,7 @@ class _Instants:
         return cls(rows=rows, frames=frames, time=instants, used=used)
 
     def spread(self, values: Floats) -> Floats:
-        """Return the values of the track at the instants, 0 or a unit matrix where nothing was measured."""
+        """Return the values of the track at the instants, 0 or a unit matrix if not measured."""
         neutral = np.zeros(3) if values.ndim == 2 else np.eye(3)
         out = np.broadcast_to(neutral, (len(self.time), *neutral.shape)).copy()
         out[self.used] = values[self.rows][self.used[self.frames]]
@@ -248,7 +248,7 @@ def _put_turns(out: dict[str, Floats], rows: Rows, at: Estimate, frame_s: float)
     out["orientation_cov_rad2"][rows] = C[:, VALUE, VALUE]
     for name, unit, power, part, values in (("omega", "rad_s", 1, SPEED, rate), ("alpha", "rad_s2", 2, CHANGE, change)):
         scale = 1.0 / frame_s**power
-        # in the body an error delta of the orientation turns the vector too: R_true' x = R' (x + x cross delta)
+        # in the body an orientation error delta rotates the vector too: R_true' x = R' (x + x cross delta)
         lever = np.cross(values[:, None, :], np.eye(3)).mT
         mixed = lever @ C[:, VALUE, part]
         whole = C[:, part, part] + lever @ C[:, VALUE, VALUE] @ lever.mT + mixed + mixed.mT

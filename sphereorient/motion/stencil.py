@@ -1,7 +1,7 @@
-"""Weighted sums over windows of neighbouring frames, each frame with weights of its own; derivatives by them.
+"""Weighted sums over windows of neighbouring frames, with separate weights for each frame; derivatives by them.
 
 A stencil is a tensor of weights (..., N, 2 h + 1): entry [k, h + j] is the weight of frame k + j in the result for
-frame k. Missing frames have weight 0; a frame whose result is not determined has NaN weights.
+frame k. Missing frames have weight 0; a frame with an undetermined result has NaN weights.
 """
 
 import math
@@ -19,7 +19,7 @@ TRUNCATE = 3.0  # holds 99.7 % of the Gaussian
 
 def windows(x: Tensor, half: int, fill: float = torch.nan) -> Tensor:
     """Return the neighbours of every frame of x (..., N): entry [k, half + j] of (..., N, 2 half + 1) is x[k + j]."""
-    # Padded by one more than needed: no frames at all have no window.
+    # Padded by one more than needed, for N = 0.
     return pad(x, (half, half + 1), value=fill).unfold(-1, 2 * half + 1, 1)[..., : x.shape[-1], :]
 
 
@@ -34,7 +34,7 @@ def neighbours_there(there: Tensor, segment: Tensor | None, half: int) -> Tensor
 
 
 def paired(there: Tensor, segment: Tensor | None, half: int) -> Tensor:
-    """Return which of the `neighbours_there` pair up, k - j with k + j: their weights have one parity in time."""
+    """Return which of the `neighbours_there` are in pairs k - j, k + j: their weights have one parity in time."""
     near = neighbours_there(there, segment, half)
     return near & near.flip(-1)
 
@@ -42,7 +42,7 @@ def paired(there: Tensor, segment: Tensor | None, half: int) -> Tensor:
 def apply(stencil: Tensor, x: Tensor) -> Tensor:
     """Return the weighted sums (..., N, D) of x (..., N, D), NaN where the stencil is; x of weight 0 may be NaN."""
     undetermined = stencil.isnan().any(-1)[..., None]
-    # zeros in place of NaN first: the gradient of an unselected NaN is NaN, too
+    # replace NaN first, whose gradient is NaN even if not selected
     weights = torch.where(undetermined, 0.0, stencil)[..., None, :]
     near = windows(x.mT, stencil.shape[-1] // 2).transpose(-3, -2)  # (..., N, D, 2 h + 1)
     sums = (weights * torch.where(weights == 0, 0.0, near)).sum(-1)
@@ -95,10 +95,10 @@ def gap_aware_stencil(
     min_share: float = 1.0,
 ) -> Tensor:
     """Return the kernel of `gaussian_derivative` at every frame, (..., N, 2 h + 1) float64, also beside missing frames.
-    A neighbour is used where its mirror image is measured and both are in the segment; polynomials stay exact. `there`
-    (..., N) marks measured frames; segment (..., N) is -1 outside any, None is one segment. NaN where less than
-    `min_share` of the Gaussian's weight is measured.
-    Raises SettingsError (an order other than 0, 1, 2, or a width that is not positive).
+    A neighbour is used if its mirror image is measured and both are in the segment; polynomials stay exact. `there`
+    (..., N) marks measured frames; segment (..., N) is -1 outside any, None is one segment. NaN if less than
+    `min_share` of the Gaussian's weight is measured. Raises SettingsError (an order other than 0, 1, 2, or a width that
+    is not positive).
     """
     like = torch.empty(0, dtype=torch.float64, device=there.device)
     gauss, step = _gaussian(sigma_frames, order, truncate, like)
@@ -106,14 +106,14 @@ def gap_aware_stencil(
     share = kept.sum(-1) / gauss.sum()
     # sums of equal terms may differ in their last digits, in float32 by 1e-6
     m0, m2, m4 = ((kept * step**power).sum(-1) for power in (0, 2, 4))
-    determinant = (m0, m2, m0 * m4 - m2**2)[order]  # 0: the remaining weights do not determine the derivative
+    determinant = (m0, m2, m0 * m4 - m2**2)[order]  # 0: the derivative is undetermined
     enough = (share >= min_share - 1e-5) & (determinant > 0)
     stencil = _with_exact_moments(torch.where(enough[..., None], kept, gauss), step, order)
     return torch.where(enough[..., None], stencil, torch.nan)
 
 
 def _gaussian(sigma_frames: float, order: int, truncate: float, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the Gaussian and its abscissae, frames, at least one to either side, which a derivative needs."""
+    """Return the Gaussian and its abscissae, frames, with at least one on either side, as a derivative needs."""
     if order not in (0, 1, 2):
         raise SettingsError(refusal("order", expected="0, 1 or 2", got=str(order), do="differentiate twice"))
     if not (sigma_frames > 0 and truncate > 0):

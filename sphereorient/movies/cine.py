@@ -14,15 +14,15 @@ from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, mapped, movie_
 FILE_HEADER = struct.Struct("<2s3HiIiI3IQ")
 BITMAP_HEADER = struct.Struct("<IiiHHIIiiII")
 SETUP_START = struct.Struct("<H138x2sH")
-SETUP = struct.Struct("<756xii4xI112xi8xI")  # both flips, frame rate, rotation, bits used; zeros where it ends earlier
+SETUP = struct.Struct("<756xii4xI112xi8xI")  # both flips, frame rate, rotation, bits used; zeros beyond its end
 BLOCK_HEADER = struct.Struct("<IHH")
 TIME_BLOCK = 1002  # a TIME64 for each image
-MAX_BLOCKS = 10_000  # tagged blocks; recorders write a handful
+MAX_BLOCKS = 10_000  # tagged blocks; recorders write few
 FLAG_BITS = np.uint64(3)  # the two lowest bits of a TIME64 are flags
 MAX_SIDE = 1 << 16  # px; larger than any sensor
 FIRST = 64  # images that determine the usual size
 JPEG, FILTER_ARRAY = 1, 2  # values of `compression`
-PREFIX = 8  # bytes before the pixels at least: size of the annotation, size of the image
+PREFIX = 8  # least bytes before the pixels: size of the annotation, size of the image
 COPY_AGAIN, EXPORT_AGAIN = "copy it from the camera again", "export it again; its header is damaged"
 _Rows = NDArray[np.uint8]  # (H, stride), as stored
 
@@ -55,7 +55,7 @@ class CineMovie(Movie):
             expected = f"images of {height} rows of at least {least} bytes"
             raise movie_error(path, expected, f"{self._image_size} bytes", EXPORT_AGAIN)
         there = np.flatnonzero((self._offsets > 0) & (self._offsets <= len(content) - prefix - self._image_size))
-        count = int(there[-1]) + 1  # one at least is whole
+        count = int(there[-1]) + 1  # at least one is whole
         used = f" ({self._real_bits} of them used)" if 0 < self._real_bits < layout.bits else ""
         super().__init__(path, f".cine, {layout.name}{used}", count, self._size, np.dtype(layout.dtype))
         self.times_s, remarks = self._times(count)
@@ -108,13 +108,13 @@ class CineMovie(Movie):
         if self._layout.colour:
             yield COLOUR_REMARK
         if self._layout.name == "packed 10 bit":
-            yield "packed 10 bit: grey values are the recorder's codes, which are not linear in brightness"
+            yield "packed 10 bit: grey values are the recorder's codes, not linear in brightness"
         if self._flip_vertical:
-            yield "its header asks for rows turned round (bFlipV), applied; if the picture stands on its head: flip"
+            yield "rows are reversed as its header states (bFlipV); if the picture is upside down: flip"
         if self._flip_horizontal:
-            yield "its header asks for columns turned round (bFlipH), applied; if the picture is mirrored: flip"
+            yield "columns are reversed as its header states (bFlipH); if the picture is mirrored: flip"
         if self._rotate_deg:
-            yield f"its header asks for a turn by {self._rotate_deg} degrees, which is not applied"
+            yield f"the rotation by {self._rotate_deg} degrees in its header is not applied"
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:
         whole = (self.path.stat().st_size,)
@@ -131,11 +131,11 @@ class CineMovie(Movie):
         upright = grey if self._top_down else grey[::-1]
         if self._flip_horizontal:
             upright = upright[:, ::-1]
-        return np.array(upright, self.dtype, order="C")  # a copy: the memory is the file's
+        return np.array(upright, self.dtype, order="C")  # a copy, as the memory is the file's
 
 
 def _prefix_and_size(content: NDArray[np.uint8], offset: int) -> tuple[int, int]:
-    """Return bytes before the pixels of an image and bytes of its pixels; (0, 0) where these are not whole."""
+    """Return the bytes before the pixels of an image and the bytes of its pixels; (0, 0) if incomplete."""
     if not 0 < offset <= len(content) - PREFIX:
         return 0, 0
     prefix = int.from_bytes(content[offset : offset + 4].tobytes(), "little")
@@ -164,7 +164,7 @@ def _read_times(file: BinaryIO, at: int, end: int, trigger: int) -> NDArray[np.f
             break
         if kind == TIME_BLOCK:
             stamps = np.frombuffer(file.read((size - BLOCK_HEADER.size) // 8 * 8), "<u8").astype(np.uint64)
-            since = (stamps & ~FLAG_BITS) - (np.uint64(trigger) & ~FLAG_BITS)  # may wrap round; right again as signed
+            since = (stamps & ~FLAG_BITS) - (np.uint64(trigger) & ~FLAG_BITS)  # may wrap around; correct if signed
             return since.view(np.int64) / 2.0**32
         at += size
     return None
@@ -187,7 +187,7 @@ def _layout(path: Path, compression: int, packing: int, bits: int) -> _Layout:
 
 def _grey(rows: _Rows, width: int, layout: _Layout) -> NDArray[Any]:
     """Return the grey values (H, W) of an image's rows."""
-    if layout.packed:  # without gaps, the most significant bits first; each pixel lies in two bytes
+    if layout.packed:  # without gaps, most significant bits first; each pixel is in two bytes
         first, offset = np.divmod(layout.bits * np.arange(width), 8)
         pair = (rows.take(first, axis=1).astype(np.uint16) << 8) | rows.take(first + 1, axis=1)
         return (pair >> (16 - layout.bits - offset).astype(np.uint16)) & np.uint16(2**layout.bits - 1)

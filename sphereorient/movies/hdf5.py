@@ -15,19 +15,19 @@ from sphereorient.movies.movie import MOST_MISSING, Grey, Movie, flipped, grey_s
 from sphereorient.movies.stamps import UNITS, Stamps, unit_in
 
 KIND = "data set (N, H, W) of uint8 or uint16"
-UPRIGHT = "higher than wide: if MATLAB wrote it by h5write, rows are columns: write flip: transpose"
+UPRIGHT = "higher than wide: if MATLAB's h5write wrote it, rows are columns: write flip: transpose"
 NAME_ONE = "name one: file.h5::group/dataset"
 AS_MOVIE = "write one channel as a data set of its own: file['grey'] = file['NAME'][..., 0]"
 SHOWN = 5  # data sets named in a refusal
 SEPARATOR = "::"  # between the file and the data set in it
 TIMES = ("time", "times", "timestamps")
-MATLAB = "MATLAB_class"  # attribute of what MATLAB saves: in the file its axes are reversed
-MAX_OBJECTS = 10_000  # searched for the one data set
-BLOCK_BYTES = 64 << 20  # held at once, of a data set whose chunks hold many frames
+MATLAB = "MATLAB_class"  # attribute of data by MATLAB, whose axes are reversed in the file
+MAX_OBJECTS = 10_000  # most objects searched for the data set
+BLOCK_BYTES = 64 << 20  # held at once, if chunks hold many frames
 
 
 class Hdf5Movie(Movie):
-    """A data set (N, H, W) of uint8 or uint16, a fourth axis of 1 left out; frames never written are unreadable."""
+    """A data set (N, H, W) of uint8 or uint16, without a fourth axis of 1; frames never written are unreadable."""
 
     def __init__(self, path: Path) -> None:
         self._file, name = split_path(path)
@@ -54,7 +54,7 @@ class Hdf5Movie(Movie):
             for number in numbers:
                 if self._blocks is not None and number // self._block not in self._blocks:
                     raise self._damage(number, "none that was ever written")
-                # Frames of one chunk are decompressed together: hold as many of them as memory allows.
+                # Frames of one chunk are decompressed together: hold up to BLOCK_BYTES of them.
                 within = number % self._block
                 start = number - within % at_once
                 if start != held:
@@ -67,13 +67,13 @@ class Hdf5Movie(Movie):
 
 
 def hdf5_movie(path: Path) -> Movie:
-    """Open a data set of a file; one that MATLAB saved, (H, W, N) there, has rows and columns as there."""
+    """Open a data set of a file; rows and columns of one saved by MATLAB, (H, W, N) there, are as in MATLAB."""
     movie = Hdf5Movie(path)
     return flipped(movie, "transpose" if movie.by_matlab else "none")
 
 
 def split_path(path: Path) -> tuple[Path, str]:
-    """Return the file and the name of the data set in it, empty if `path` has none."""
+    """Return the file and the name of its data set, empty if `path` has none."""
     file, _, name = str(path).partition(SEPARATOR)
     return Path(file), name
 
@@ -94,7 +94,7 @@ def _opened(path: Path, file: Path) -> Iterator[Any]:
 
 
 def _data_set(path: Path, file: Any, name: str) -> Any:
-    """Return the named data set, or the only one that can be a movie; refuse one in other files."""
+    """Return the named data set, or the only one that can be a movie; refuse one stored in other files."""
     if name:
         data = _follow(path, file, name)
     else:
@@ -120,7 +120,7 @@ def _data_set(path: Path, file: Any, name: str) -> Any:
 
 
 def _follow(path: Path, file: Any, name: str) -> Any:
-    """Return an object by its name, through groups of this file only: links may lead to other files."""
+    """Return an object by its name, through groups of this file only, as links may lead to other files."""
     here = file
     for part in name.strip("/").split("/"):
         link = here.get(part, getlink=True) if isinstance(here, h5py.Group) and part else None
@@ -147,7 +147,7 @@ def _data_sets(file: Any, wanted: Callable[[Any], bool] = lambda thing: isinstan
         seen += 1
         if wanted(thing):
             found.append(name)
-        return True if seen > MAX_OBJECTS else None  # anything but None ends the walk
+        return True if seen > MAX_OBJECTS else None  # other values than None end the walk
 
     file.visititems(visit)  # visits each object once, and follows no links to other files
     return found
@@ -186,7 +186,7 @@ def _written(path: Path, data: Any, file_bytes: int) -> tuple[int, frozenset[int
 
 
 def _times(data: Any, stated: int, count: int) -> tuple[Stamps | None, str, tuple[str, ...]]:
-    """Return the times (count,), s, beside a data set, their unit by the file, or a remark why they are not used."""
+    """Return the times (count,), s, beside a data set, their unit in the file, or a remark why they are not used."""
     for name in TIMES:
         if not isinstance(data.parent.get(name, getlink=True), h5py.HardLink):
             continue

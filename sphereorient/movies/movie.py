@@ -12,10 +12,10 @@ from sphereorient.files.picture import OnDemand
 from sphereorient.movies.stamps import Stamps, other_units, rate_of
 
 Grey = NDArray[Any]  # (H, W) or (n, H, W), uint8 or uint16, row 0 on top
-FRAMES_A_MAP = 64  # after which a file is mapped anew: read pages count as memory meanwhile
-OTHERS = "ask for frames that the movie has"
+FRAMES_A_MAP = 64  # after which a file is mapped anew, as read pages count as memory
+OTHERS = "use frame numbers of the movie"
 MOST_PIXELS = 1 << 26  # more than any movie camera has
-MOST_MISSING = 100  # times the pictures that are there: with more gaps the numbers are not frame numbers
+MOST_MISSING = 100  # times the existing pictures: with more gaps the numbers are not frame numbers
 GAMMA_CODED = "usually gamma-coded: response: srgb"
 COLOUR_REMARK = f"colour, made grey (0.299 R + 0.587 G + 0.114 B); {GAMMA_CODED}"
 FLIPS = {"none": (1, 1), "vertical": (-1, 1), "horizontal": (1, -1), "both": (-1, -1), "transpose": (1, 1)}  # steps
@@ -27,11 +27,11 @@ class Movie:
     path: Path
     format: str  # kind of file, codec, bits, in words
     frame_shape: tuple[int, int]  # (H, W)
-    dtype: np.dtype[Any]  # uint8, or uint16 where the file holds more than 8 bits; values are not rescaled
-    times_s: Stamps | None = None  # (N,), s, time stamps of the recording; None: none, or those of a player
-    times_unit: str = "s"  # of these stamps by the file; empty: it states none, and s is a guess
-    played_hz: float | None = None  # rate at which players show it; that of the recording only of an ordinary camera
-    photographs: bool = False  # whether these are picture files of 8 bits, as ordinary cameras write them
+    dtype: np.dtype[Any]  # uint8, or uint16 for files with more than 8 bits; values are not rescaled
+    times_s: Stamps | None = None  # (N,), s, time stamps of the recording; None: none, or of a player
+    times_unit: str = "s"  # of these stamps in the file; empty: not stated, s is assumed
+    played_hz: float | None = None  # rate of players; the recording's rate only for ordinary cameras
+    photographs: bool = False  # whether these are 8-bit picture files of an ordinary camera
     remarks: tuple[str, ...] = ()  # warnings for the user: truncated, colour converted to grey, lossy codec
 
     def __init__(self, path: Path, form: str, count: int, frame_shape: tuple[int, int], dtype: np.dtype[Any]) -> None:
@@ -46,7 +46,7 @@ class Movie:
         raise NotImplementedError
 
     def _read_on(self, numbers: Sequence[int]) -> Iterator[Grey | None]:
-        """Yield these frames, None for damaged ones; restart after each, as frames are independent."""
+        """Yield these frames, None for damaged ones; restart after each, for independent frames."""
         while numbers:
             try:
                 for picture in self._read(numbers):
@@ -61,7 +61,7 @@ class Movie:
 
     @property
     def likely_units(self) -> str:
-        """Units, in words, of time stamps without a stated unit whose rate in s is doubtful; empty: they are in s."""
+        """Possible units of time stamps without a stated unit and with a doubtful rate in s, as text; empty: s."""
         return "" if self.times_s is None or self.times_unit else other_units(rate_of(self.times_s))
 
     def frames(self, first: int = 0, last: int | None = None) -> Iterator[Grey]:
@@ -73,7 +73,7 @@ class Movie:
         return self._read_on(self._range(first, last))
 
     def on_demand(self, pool: Executor, first: int = 0, last: int | None = None) -> Iterator[Grey | OnDemand | None]:
-        """Yield frames as `readable` does; of movies that allow it, pictures decoded in `pool` part by part."""
+        """Yield frames as `readable`; for movies that allow it, pictures decoded in `pool` part by part."""
         return self.readable(first, last)
 
     def sample(self, indices: Sequence[int]) -> Grey:
@@ -101,7 +101,7 @@ class Movie:
     def _truncated(self, stated: int) -> tuple[str, ...]:
         """Return the remark on a movie whose header states more frames than the file holds."""
         there = len(self)
-        return (f"truncated: its header tells of {stated} frames, {there} are there",) if there < stated else ()
+        return (f"truncated: its header states {stated} frames, the file holds {there}",) if there < stated else ()
 
     def __enter__(self) -> Self:
         return self
@@ -116,7 +116,7 @@ class FlippedMovie(Movie):
     def __init__(self, movie: Movie, how: str) -> None:
         super().__init__(movie.path, movie.format, len(movie), flipped_shape(movie.frame_shape, how), movie.dtype)
         self.times_s, self.times_unit, self.played_hz = movie.times_s, movie.times_unit, movie.played_hz
-        others = (remark for remark in movie.remarks if f"flip: {how}" not in remark)  # without the advice to do so
+        others = (remark for remark in movie.remarks if f"flip: {how}" not in remark)  # without the advice to flip
         self.remarks = (*others, f"flipped on reading: {how}")
         self.photographs = movie.photographs
         self._movie, self._how = movie, how
@@ -130,8 +130,8 @@ class FlippedMovie(Movie):
 
 
 def flipped(movie: Movie, how: str) -> Movie:
-    """Return a movie mirrored as `how` says: none, vertical (rows reversed), horizontal (columns), both, or transpose
-    (rows become columns, as in files written by MATLAB).
+    """Return a movie flipped by `how`: none, vertical (rows reversed), horizontal (columns), both, or transpose (rows
+    become columns, as in files written by MATLAB).
     """
     if how not in FLIPS:
         raise movie_error(f"{movie.path}, flip", ", ".join(FLIPS), f"'{how}'", "write one of these")
@@ -139,19 +139,19 @@ def flipped(movie: Movie, how: str) -> Movie:
 
 
 def flipped_picture(picture: NDArray[Any], how: str) -> NDArray[Any]:
-    """Mirror a picture (..., H, W) as `flipped` mirrors a movie."""
+    """Flip a picture (..., H, W) as `flipped` flips a movie."""
     rows, columns = FLIPS[how]
     turned = picture.swapaxes(-1, -2) if how == "transpose" else picture
     return np.ascontiguousarray(turned[..., ::rows, ::columns])
 
 
 def flipped_shape(frame_shape: tuple[int, int], how: str) -> tuple[int, int]:
-    """Return the shape (H, W) of pictures that `flipped_picture` mirrors."""
+    """Return the shape (H, W) of pictures flipped by `flipped_picture`."""
     return (frame_shape[1], frame_shape[0]) if how == "transpose" else frame_shape
 
 
 def grey_shape(shape: Sequence[int]) -> tuple[int, int, int] | None:
-    """Return (N, H, W) of an array of grey pictures, of four axes if one after the first is 1; None of other arrays."""
+    """Return (N, H, W) of an array of grey pictures, or of one with a further axis of 1; None for other arrays."""
     sizes = [int(size) for size in shape]
     if len(sizes) == 4 and sizes[1:].count(1) == 1:
         del sizes[sizes.index(1, 1)]
@@ -161,7 +161,7 @@ def grey_shape(shape: Sequence[int]) -> tuple[int, int, int] | None:
 def mapped(
     path: Path, numbers: Sequence[int], dtype: np.dtype[Any], offset: int, shape: tuple[int, ...]
 ) -> Iterator[tuple[int, NDArray[Any]]]:
-    """Yield frame numbers with the array of a file mapped into memory; a new map every 64 frames keeps memory flat."""
+    """Yield frame numbers with the array of a file mapped into memory; a new map every 64 frames bounds the memory."""
     for place, number in enumerate(numbers):
         if place % FRAMES_A_MAP == 0:
             values = np.memmap(path, dtype, "r", offset, shape)
@@ -169,5 +169,5 @@ def mapped(
 
 
 def movie_error(name: object, expected: str, got: str, do: str) -> MovieError:
-    """Return the MovieError about a movie file, or a thing in it."""
+    """Return the MovieError about a movie file, or a part of it."""
     return MovieError(refusal(str(name), expected=expected, got=got, do=do))

@@ -9,14 +9,14 @@ import numpy as np
 from sphereorient.errors import error_words
 from sphereorient.movies.movie import Grey, Movie, grey_shape, mapped, movie_error
 
-# numpy parses a header as a Python literal, and old ones as its tokens.
+# numpy parses a header as a Python literal, an old one as its tokens.
 DAMAGE = (OSError, ValueError, EOFError, TypeError, LookupError, SyntaxError, TokenError, RecursionError, MemoryError)
 ZIP = b"PK"  # numpy's archives of several arrays, whatever their suffix
 SAVE_AGAIN = "write it again with numpy.save"
 
 
 class NpyMovie(Movie):
-    """A .npy file, (N, H, W), uint8 or uint16; a fourth axis of one channel is left out."""
+    """A .npy file, (N, H, W), uint8 or uint16, without a fourth axis of one channel."""
 
     def __init__(self, path: Path) -> None:
         shape, self._stored, self._offset = _header(path)

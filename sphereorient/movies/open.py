@@ -22,16 +22,15 @@ CONVERT = {  # files that ffmpeg does not read, by suffix
     **dict.fromkeys((".mraw", ".cih", ".cihx"), PHOTRON),
     ".seq": "convert it in Python: numpy.save('FILE.npy', numpy.array(pims.NorpixSeq('FILE.seq'))); pip install pims",
     ".fmf": "convert it with motmot.FlyMovieFormat: fmf2bmps FILE.fmf --extension=png --outdir=FILE; name that folder",
-    ".slp": "name the movie that was labelled: this file holds labels, and at most the labelled frames",
+    ".slp": "name the labelled movie: this file holds labels, and at most the labelled frames",
 }
 
 
 def open_movie(path: Path | str) -> Movie:
     """Open a movie by the suffix of its file.
     Videos: .mkv, .avi, .mp4, .mov (any codec of FFmpeg), .cine. Stacks of uint8 or uint16: .tif, .tiff, .npy (N, H, W),
-    .h5, .hdf5, .mat of v7.3 (its only such data set, or `file.h5::group/dataset`). Pictures: one, a folder, a pattern
-    with * or %05d.
-    Raises MovieError: missing, of another suffix, unreadable, or empty.
+    .h5, .hdf5, .mat of v7.3 (its only such data set, or `file.h5::group/dataset`). Pictures: one, a folder, or a
+    pattern with * or %05d. Raises MovieError: missing, of another suffix, unreadable, or empty.
     """
     path = Path(path)
     if _is_sequence(path):
@@ -64,7 +63,7 @@ def _is_sequence(path: Path) -> bool:
 
 
 def _is(path: Path, kind: Callable[[Path], bool]) -> bool:
-    """Call `Path.is_dir` or `Path.is_file`; False for names that are too long for any file."""
+    """Call `Path.is_dir` or `Path.is_file`; False for names too long for any file."""
     try:
         return kind(path)
     except OSError:

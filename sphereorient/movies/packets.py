@@ -9,12 +9,12 @@ from itertools import pairwise
 from math import gcd
 from typing import NamedTuple
 
-MOST_MISSING = 10  # times the packets in the file: with more gaps the time stamps are not evenly spaced
+MOST_MISSING = 10  # times the packets in the file: with more missing, the time stamps are not evenly spaced
 OFF_GRID = 0.45  # of the frame period: a larger deviation means unevenly spaced frames
 
 
 class Packet(NamedTuple):
-    """What the container states of one packet."""
+    """The container's entries for one packet."""
 
     pts: int | None  # presentation stamp
     dts: int | None  # decoding stamp
@@ -26,12 +26,12 @@ class Packet(NamedTuple):
 class PacketIndex:
     """Number of frames, their packets, and where decoding may start."""
 
-    count: int  # frames, those without a packet included
+    count: int  # frames, including those without a packet
     by_place: bool = False  # keys of `number_of` are byte offsets, else presentation stamps
     number_of: dict[int, int] | None = None  # stamp or offset -> frame number; None: frames can only be counted
     keys: tuple[tuple[int, int], ...] = ((0, 0),)  # (frame number, stamp to seek to) of key frames, increasing
     order: tuple[int, ...] = ()  # frame numbers in decoding order
-    groups: tuple[int, ...] = ()  # indices into `order` where a key frame begins a group
+    groups: tuple[int, ...] = ()  # indices into `order` of key frames that begin a group
 
     @property
     def each_alone(self) -> bool:
@@ -40,7 +40,7 @@ class PacketIndex:
 
     @property
     def missing(self) -> list[int]:
-        """Frames without a packet, according to the time stamps."""
+        """Frames without a packet, by the time stamps."""
         return sorted(set(range(self.count)) - set(self.order)) if len(self.order) not in (0, self.count) else []
 
     def number(self, pts: int | None, pos: int | None) -> int | None:
@@ -53,7 +53,7 @@ class PacketIndex:
         return self.keys[max(bisect_right(self.keys, number, key=lambda key: key[0]) - 1, 0)]
 
     def runs(self, numbers: Sequence[int]) -> list[list[int]]:
-        """Split increasing frame numbers where a key frame lies in a gap, so that a seek saves decoding."""
+        """Split increasing frame numbers at gaps with a key frame, where a seek saves decoding."""
         runs: list[list[int]] = []
         for number in numbers:
             if runs and self.key_before(number)[0] <= runs[-1][-1] + 1:
@@ -63,7 +63,7 @@ class PacketIndex:
         return runs
 
     def spoilt_by(self, number: int) -> Sequence[int]:
-        """Return the frames that damage in frame `number` may spoil, itself included; all later ones if unknown."""
+        """Return the frames that damage in frame `number` may affect, itself included; all later ones if unknown."""
         if not self.order:
             return range(number, self.count)
         if self.each_alone or number not in self.order:
@@ -91,7 +91,7 @@ def _by_stamps(packets: list[Packet], stamps: list[int], step: Fraction | None) 
     numbers = (_on_grid(stamps, step) if step and stamps else None) or range(len(stamps))
     number_of = dict(zip(stamps, numbers, strict=True))
     order = tuple(number_of[packet.pts] for packet in packets if packet.pts is not None)
-    # Containers search by either stamp: seeking to the decoding stamp lands on the key frame or before it.
+    # Containers search by either stamp: a seek to the decoding stamp ends at the key frame or before it.
     keys = sorted(
         (number, packet.pts if packet.dts is None else packet.dts)
         for number, packet in zip(order, packets, strict=True)
@@ -107,14 +107,14 @@ def _on_grid(stamps: list[int], step: Fraction) -> list[int] | None:
     off = max(abs(stamp - stamps[0] - number * step) for stamp, number in zip(stamps, numbers, strict=True))
     if off > min(1, OFF_GRID * step) or numbers[-1] > MOST_MISSING * len(stamps) or len(set(numbers)) < len(stamps):
         return None
-    every = reduce(gcd, numbers, 0) or 1  # headers that count fields state two a frame
+    every = reduce(gcd, numbers, 0) or 1  # headers that count fields state two per frame
     return [number // every for number in numbers]
 
 
 def _by_places(packets: list[Packet], places: list[int]) -> PacketIndex:
-    """Number key frames in file order: MKV counts whole ms, so above 1 kHz stamps repeat."""
+    """Number key frames in file order; MKV has stamps in whole ms, which repeat above 1 kHz."""
     every = tuple(range(len(packets)))
-    # A seek finds any packet of a repeated stamp: to be before all of them, seek to the stamp before.
+    # A seek finds any packet of a repeated stamp: seek to the stamp before.
     keys = [(0, 0)]
     for number, (before, here) in enumerate(pairwise(packets), start=1):
         if before.pts is not None and here.pts is not None and before.pts < here.pts:

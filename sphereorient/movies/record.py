@@ -18,20 +18,20 @@ from sphereorient.errors import SphereOrientError, refusal
 from sphereorient.movies.movie import Grey, Movie
 from sphereorient.movies.write import write_movie
 
-RING_BYTES, MOST_WAIT = 128 << 20, 1000  # of the frames that wait for the disk; the smallest pipe holds so many times
-LEFT_BYTES = 200_000_000  # of the disk for others: a recording ends before it is full
-EVERY = 64  # frames from one look at the disk to the next
-BEGIN_S, ROOM_S, SHORTEST_S = 20.0, 0.001, 1e-6  # for the process to begin; between looks for room; of a frame
+RING_BYTES, MOST_WAIT = 128 << 20, 1000  # of frames waiting for the disk; times that fit into the smallest pipe
+LEFT_BYTES = 200_000_000  # left free on the disk when a recording ends
+EVERY = 64  # frames between checks of the disk
+BEGIN_S, ROOM_S, SHORTEST_S = 20.0, 0.001, 1e-6  # for the process to start; between checks for room; least of a frame
 
 
-# Memory of both processes: frames, how many of them are written, and shape and type of one.
+# Shared memory: frames, the number of written ones, and shape and type of one.
 _Ring = tuple[Any, Any, tuple[int, int], "np.dtype[Any]"]
 
 
 class Recorder:
-    """Records frames, alike those of a movie, and their times in a process of its own. The new movie, .mkv or .h5, gets
-    its name once it is whole, also after a kill of this process. `log` gets a line where frames begin to be lost, and
-    where the file takes no more: then nothing more is recorded. `wait`: for room, instead of losing frames.
+    """Records frames like those of a movie, and their times, in a separate process. The new movie, .mkv or .h5, gets
+    its name when it is complete, also after a kill of this process. `log` gets a line when frames begin to be lost,
+    and when the file cannot be written further: then recording ends. `wait`: wait for room instead of losing frames.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Recorder:
         stamps, self._stamps = spawn.Pipe(duplex=False)
         self._lines, lines = spawn.Pipe(duplex=False)
         ring = memory, self._written, like.frame_shape, dtype
-        arguments = path, ring, stamps, lines, max(SHORTEST_S, frame_s), LEFT_BYTES  # NaN: of a single frame
+        arguments = path, ring, stamps, lines, max(SHORTEST_S, frame_s), LEFT_BYTES  # NaN for a single frame
         self._process = spawn.Process(target=_record, args=arguments, name="recorder")
         self._process.start()
         stamps.close()
@@ -71,7 +71,7 @@ class Recorder:
             self._log(refusal(str(self._path), expected="a process that records", got=got, do=do))
 
     def room(self) -> bool:
-        """Return whether there is room for a frame, or it is not recorded any more."""
+        """Return whether there is room for a frame, or recording has ended."""
         while self._sent - self._written.value >= len(self._frames) and not self._ended:
             if not self._wait:
                 return False
@@ -79,32 +79,32 @@ class Recorder:
         return True
 
     def take(self, time_s: float, picture: Grey | None, room: bool) -> None:
-        """Take a frame, black for None, where there is room, or count it as lost."""
+        """Take a frame, black for None, if there is room; else count it as lost."""
         if not room:
             if not self._lost:
-                self._log(f"{self._path}: frames are lost: they come faster than they are written.")
+                self._log(f"{self._path}: frames are lost, as they arrive faster than they are written.")
             self._lost += 1
             return
         self._frames[self._sent % len(self._frames)] = 0 if picture is None else picture
         try:
             self._stamps.send_bytes(struct.pack("d", time_s))
             self._sent += 1
-        except OSError:  # it has ended, or was closed
+        except OSError:  # the process has ended, or was closed
             self._ended, self._lost = True, self._lost + (not self._stamps.closed)
 
     def summary(self) -> str:
-        """Return what was recorded, in words."""
+        """Return a summary of the recording as text."""
         written = int(self._written.value)
         return f"{self._path}: {written} frames recorded, {self._lost + self._sent - written} lost"
 
     def close(self) -> None:
-        """Write what waits, and give the movie its name."""
+        """Write the waiting frames, and give the movie its name."""
         self._stamps.close()
         self._thread.join()
 
 
 def _record(path: Path, ring: _Ring, stamps: Connection, lines: Connection, frame_s: float, left_bytes: int) -> None:
-    """Write a movie of the frames whose times come, until their sender ends; send a line for what goes wrong."""
+    """Write a movie of the frames whose times arrive, until the sender ends; send a line for each problem."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking
     memory, written, shape, dtype = ring
     times_s, frames = list[float](), np.frombuffer(memory, dtype).reshape(-1, *shape)
@@ -125,8 +125,8 @@ def _record(path: Path, ring: _Ring, stamps: Connection, lines: Connection, fram
                 yield frames[written.value % len(frames)]
                 written.value += 1
 
-    lines.send_bytes(b"")  # it has begun
+    lines.send_bytes(b"")  # started
     try:
         write_movie(path, taken(), times_s, 1 / frame_s)
     except SphereOrientError as error:
-        lines.send_bytes(str(error).encode() if times_s else b"")  # without frames no movie is expected
+        lines.send_bytes(str(error).encode() if times_s else b"")  # without frames there is no movie

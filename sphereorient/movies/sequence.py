@@ -21,8 +21,8 @@ PICTURES = (".png", ".bmp", ".pgm", ".ppm", *LOSSY, *TIFF)
 WILD = re.compile(r"(\*|%0?\d*d)")
 DIGITS = re.compile(r"(\d+)")
 SHOWN = 5  # gaps named in a remark
-ENOUGH, TRIED = 5, 64  # pictures that determine the size, and how many are tried if the first ones are damaged
-LARGEST_BYTES = 1 << 28  # of a picture file, which is read whole
+ENOUGH, TRIED = 5, 64  # pictures that determine the size; most tried if the first ones are damaged
+LARGEST_BYTES = 1 << 28  # of a picture file
 
 
 class SequenceMovie(Movie):
@@ -85,7 +85,7 @@ def sequence_files(path: Path) -> list[Path]:
 
 
 def _numbered(path: Path, files: list[Path]) -> dict[int, Path]:
-    """Return number -> file; the number is the only part of the names that differs between files."""
+    """Return files by number, the only part of the names that differs between files."""
     names = [DIGITS.split(file.stem) for file in files]
     words = [(*name[0::2], file.suffix) for name, file in zip(names, files, strict=True)]
     do = "choose one movie's pictures by a pattern, such as cam1_*.tif"
@@ -148,7 +148,7 @@ def _read_picture(path: Path) -> tuple[Grey, bool]:
         raise movie_error(path, expected, f"{claimed / 1e6:.3g} million", do)
     if claimed > LARGEST_RATIO * len(content):
         raise movie_error(path, "a picture", "a header that claims more than the file can hold", "export it again")
-    # As stored: neither rotated by the camera's orientation tag nor reduced to 8 bit.
+    # As stored: not rotated by the camera's orientation tag, nor reduced to 8 bit.
     picture = decoded(content, cv2.IMREAD_UNCHANGED) if claimed else None
     if picture is None:
         raise movie_error(path, "a picture", "none that can be decoded", "export it again")

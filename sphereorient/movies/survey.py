@@ -9,11 +9,11 @@ from sphereorient.movies.movie import Grey, Movie
 
 UNDECODABLE, DARK, SATURATED, REPEATED = "undecodable", "black", "saturated", "repeated"
 FAULTS = (UNDECODABLE, DARK, SATURATED, REPEATED)
-DARK_LEVEL = 0.2  # of the brightness that frames of this movie usually reach
+DARK_LEVEL = 0.2  # of the usual brightness of the movie's frames
 WHITE_SHARE = 0.2  # of the pixels at full scale
 BRIGHT_QUANTILE = 0.999  # of the pixels of a frame: its brightness without hot pixels
 SCALES = (255, 1023, 4095, 16383, 65535)  # largest values of 8, 10, 12, 14 and 16 bit
-SHOWN_PX = 320  # longest side of the small pictures that are kept
+SHOWN_PX = 320  # longest side of the kept small pictures
 
 
 @dataclass(kw_only=True, eq=False)
@@ -32,9 +32,9 @@ class SurveyedFrame:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What some frames of a movie show, and their faults."""
+    """A sample of a movie's frames, and their faults."""
 
-    frames: tuple[SurveyedFrame, ...]  # evenly spread over the movie, to be shown
+    frames: tuple[SurveyedFrame, ...]  # evenly spread over the movie, for display
     looked: int  # number of frames examined
     lowest: int  # grey levels
     highest: int

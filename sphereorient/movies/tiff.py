@@ -18,7 +18,7 @@ from sphereorient.files.picture import luma
 from sphereorient.files.whole_file import LARGEST_RATIO
 from sphereorient.movies.movie import COLOUR_REMARK, Grey, Movie, mapped, movie_error
 
-# What tifffile and imagecodecs raise on damaged files, depending on the place of the damage.
+# Exceptions of tifffile and imagecodecs on damaged files, depending on the damage.
 DAMAGE = (
     *(ValueError, TypeError, LookupError, ArithmeticError, AttributeError, OSError, EOFError, RuntimeError),
     *(MemoryError, AssertionError, struct.error, zlib.error, lzma.LZMAError, TiffFileError),
@@ -27,7 +27,7 @@ WHITE_IS_ZERO, BLACK_IS_ZERO, RGB = 0, 1, 2  # PhotometricInterpretation
 UNCOMPRESSED = 1
 STEPS = {1: (1, 1), 2: (1, -1), 3: (-1, -1), 4: (-1, 1)}  # of rows and columns, by orientation
 
-logging.getLogger("tifffile").addHandler(logging.NullHandler())  # damage is reported by our own refusals
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # damage is reported by refusals
 
 
 class TiffMovie(Movie):
@@ -112,13 +112,13 @@ def _first_page(path: Path, file: TiffFile) -> Any:
 
 
 def _check_claim(page: Any) -> None:
-    stored = min(sum(page.databytecounts), page.parent.filehandle.size)  # the counts are a claim too
+    stored = min(sum(page.databytecounts), page.parent.filehandle.size)  # the counts may be wrong too
     if not page.nbytes or page.nbytes > LARGEST_RATIO * stored:
         raise ValueError(f"a page {page.shape} with {stored} bytes of pixels")
 
 
 def _stated(path: Path, file: TiffFile) -> int:
-    """Return how many pictures the metadata of ImageJ, OME or tifffile states, 0 without metadata."""
+    """Return the number of pictures by the metadata of ImageJ, OME or tifffile; 0 without metadata."""
     try:
         if file.is_ome:
             text, page = str(file.ome_metadata), _first_page(path, file)
@@ -147,10 +147,10 @@ def _stated(path: Path, file: TiffFile) -> int:
 
 
 def _steps(path: Path, page: Any) -> tuple[int, int]:
-    tag = page.tags.get(274)  # tag: where row 0 and column 0 are
+    tag = page.tags.get(274)  # tag: position of row 0 and column 0
     orientation = 1 if tag is None else tag.value
     steps = STEPS.get(orientation)
     if steps is None:
         got = f"orientation {orientation}"
-        raise movie_error(path, "pages that are not turned by 90 degrees", got, "export it upright")
+        raise movie_error(path, "pages that are not rotated by 90 degrees", got, "export it upright")
     return steps

@@ -1,4 +1,4 @@
-"""Videos that FFmpeg decodes: exact seeks, exact grey values, nothing decoded from damaged data."""
+"""Videos decoded by FFmpeg: exact seeks, exact grey values, no pictures from damaged data."""
 
 import ctypes
 from collections import deque
@@ -22,15 +22,15 @@ from sphereorient.movies.stamps import Stamps, rate_of, spacing
 
 Found = TypeVar("Found")
 LOSSLESS = "lossless"
-PLANE_0_IS_GREY = ("gray", "yuv", "nv", "p01")  # pixel formats that begin so may have a grey first plane
+PLANE_0_IS_GREY = ("gray", "yuv", "nv", "p01")  # beginnings of pixel formats that may have a grey first plane
 NOTHING = "none from the decoder"
-PACKETS_TRIED = 8  # of FFV1: if the check sums of one are right, all packets have them
-TURNED_REMARK = "read as it is stored: players and ffmpeg turn it by {} degrees clockwise, as its rotation tag says"
-FIELDS_REMARK = "interlaced, two instants a frame; part them: ffmpeg -i MOVIE -vf bwdif=send_field -c:v ffv1 NEW.mkv"
+PACKETS_TRIED = 8  # of FFV1: if the check sums of one are right, all packets have check sums
+TURNED_REMARK = "read as stored: players and ffmpeg rotate it by {} degrees clockwise, by its rotation tag"
+FIELDS_REMARK = "interlaced, two instants a frame; separate: ffmpeg -i MOVIE -vf bwdif=send_field -c:v ffv1 NEW.mkv"
 UNKNOWN, PROGRESSIVE = 0, 1  # field orders of FFmpeg; others are interlaced
-COARSE = 0.1  # steps of time stamps, of the usual time between frames: coarser ones are not used
+COARSE = 0.1  # of the usual time between frames: coarser time stamps are not used
 SHOWN = 8  # missing frames named in a remark
-SLACK = 1.5  # frames by which a rounded duration may be too long
+SLACK = 1.5  # largest excess of a rounded duration, frames
 
 
 class VideoMovie(Movie):
@@ -49,7 +49,7 @@ class VideoMovie(Movie):
             interlaced = frame.interlaced_frame or by_stream
             rate = container.streams.video[0].average_rate
             self.played_hz = float(rate) if rate else None
-        self._checked = False  # whether the packets carry check sums that can be verified
+        self._checked = False  # whether the packets have verifiable check sums
         with _opened(path) as container:
             self._index, end_s, broken = self._read_index(container)
             count = self._index.count
@@ -63,7 +63,7 @@ class VideoMovie(Movie):
             self.remarks = (*damaged, *cut_off, *turned, *fields, *spaced, *known)
 
     def _read_index(self, container: av.container.InputContainer) -> tuple[PacketIndex, float, str]:
-        """Return the packet table, the end of the last frame, s, and the error that ended it, if any."""
+        """Return the packet table, the end of the last frame, s, and the error that ended the table, if any."""
         stream = container.streams.video[0]
         packets: list[Packet] = []
         end, broken = 0, ""
@@ -76,7 +76,7 @@ class VideoMovie(Movie):
                     end = max(end, (packet.pts or 0) + (packet.duration or 0))
         except av.FFmpegError as error:
             broken = error_words(error)
-        # AVI stores no presentation stamps: where frames are reordered, FFmpeg's guesses are wrong after a seek.
+        # AVI stores no presentation stamps: for reordered frames, FFmpeg's guesses are wrong after a seek.
         guessed = container.format.name == "avi" and any(packet.pts != packet.dts for packet in packets)
         step: Fraction | None = None
         if stream.average_rate and stream.time_base:
@@ -93,7 +93,7 @@ class VideoMovie(Movie):
         return (None if isinstance(got, MovieError) else got for got in self._decode(numbers))
 
     def on_demand(self, pool: Executor, first: int = 0, last: int | None = None) -> Iterator[Grey | OnDemand | None]:
-        """Yield frames as `readable` does; of FFV1 whose slices stand alone, these are decoded when asked for."""
+        """Yield frames as `readable`; slices of FFV1 with independent frames are decoded on request."""
         if self._slice_decoder is None:
             yield from self.readable(first, last)
             return
@@ -108,7 +108,7 @@ class VideoMovie(Movie):
 
     @cached_property
     def _slice_decoder(self) -> SliceDecoder | None:
-        """What decodes slices alone; None for other videos, and where that gives other pictures than whole frames."""
+        """Decoder of separate slices; None for other videos, and if its pictures differ from whole frames."""
         alone = self._index.number_of is not None and self._index.each_alone
         if not (self._checked and alone and self._pixels.startswith("gray")):
             return None
@@ -125,7 +125,7 @@ class VideoMovie(Movie):
         return decoder if alike else None
 
     def _packets(self, numbers: range) -> Iterator[tuple[int, bytes | None]]:
-        """Yield increasing frame numbers with their packets, None where the file holds none."""
+        """Yield increasing frame numbers with their packets, None for frames without a packet."""
         if not numbers:
             return
         with _opened(self.path) as container:
@@ -178,12 +178,12 @@ class VideoMovie(Movie):
                 yield self._picture(frame, number)
 
     def _decoded(self, container: av.container.InputContainer) -> Iterator[tuple[int, av.VideoFrame | str]]:
-        """Decode from the container's position on; yield frame numbers with the frame or the error in words."""
-        following = 0  # for videos whose frames can only be counted, from the start
+        """Decode from the container's position on; yield frame numbers with the frame or the error as text."""
+        following = 0  # for videos whose frames can only be counted from the start
         for packet in _demuxed(container):
             number = self._index.number(packet.pts, packet.pos)
             if number is not None:
-                packet.pts = number  # the decoder passes it on to the frame, in any order
+                packet.pts = number  # the decoder passes the number on to the frame, in any order
             if packet.size and self._checked and split_slices(bytes(packet)) is None:
                 yield (following if number is None else number), "one whose check sum is wrong"
                 continue
@@ -206,7 +206,7 @@ class VideoMovie(Movie):
 
 
 def _aligned(numbers: Sequence[int], found: Iterable[tuple[int | None, Found]]) -> Iterator[tuple[int, Found | None]]:
-    """Yield increasing frame numbers with what was found of them, None without; other findings are left out."""
+    """Yield increasing frame numbers with the results for them, None without; other results are left out."""
     waiting = deque(numbers)
     for number, thing in found:
         while waiting and number is not None and waiting[0] < number:
@@ -232,14 +232,14 @@ def _opened(path: Path) -> av.container.InputContainer:
     if context is None:
         container.close()
         raise movie_error(path, "a movie that FFmpeg decodes", "an unknown codec", "export it as FFV1 in .mkv")
-    # Slices of one frame in parallel: 1.8 times faster for FFV1 on 2 cores, and errors keep their frame.
+    # Slices of one frame in parallel: 1.8 times faster for FFV1 on 2 cores; errors stay with their frame.
     context.thread_type, context.thread_count = "SLICE", 2
     context.options = {"err_detect": "crccheck+explode"}
     return container
 
 
 def _demuxed(container: av.container.InputContainer) -> Iterator[Any]:
-    """Yield the packets as far as the file can be read, at last the empty one that ends decoding."""
+    """Yield the packets up to the end or damage of the file, then the empty one that ends decoding."""
     try:
         yield from container.demux(container.streams.video[0])
     except av.FFmpegError:
@@ -247,7 +247,7 @@ def _demuxed(container: av.container.InputContainer) -> Iterator[Any]:
 
 
 def _first_frame(container: av.container.InputContainer) -> av.VideoFrame | None:
-    """Return the first decodable frame: damage at the start does not make the movie unreadable."""
+    """Return the first decodable frame; damage at the start does not make the movie unreadable."""
     for packet in _demuxed(container):
         try:
             frames: list[av.VideoFrame] = packet.decode()
@@ -262,17 +262,17 @@ def _remarks(container: av.container.InputContainer, pixels: str, index: PacketI
     stream = container.streams.video[0]
     if index.missing:
         some = ", ".join(map(str, index.missing[:SHOWN])) + (" ..." if len(index.missing) > SHOWN else "")
-        yield f"its time stamps leave out frames, which count as unreadable ({len(index.missing)}): {some}"
+        yield f"frames are missing by its time stamps and count as unreadable ({len(index.missing)}): {some}"
     if _loss(stream.codec_context) != LOSSLESS:
         yield f"codec {stream.codec_context.name} ({_loss(stream.codec_context)}): fine detail may be lost"
     if av.VideoFormat(pixels).is_rgb:
         yield COLOUR_REMARK
     elif not pixels.startswith("gray"):
-        yield f"stored as colour ({pixels}): its brightness is taken as it is; {GAMMA_CODED}"
+        yield f"stored as colour ({pixels}): its brightness is used unchanged; {GAMMA_CODED}"
 
 
 def _uneven_times(index: PacketIndex, tick: Fraction | None) -> tuple[Stamps | None, tuple[str, ...]]:
-    """Return stamps that are spaced unevenly, by a recorder, (N,), s, with a remark; None: even ones, for players."""
+    """Return unevenly spaced stamps of a recorder, (N,), s, with a remark; None for even ones, of players."""
     marks, tick_s = sorted({} if index.by_place else index.number_of or {}), float(tick or 0)
     times_s = np.array(marks, np.float64) * tick_s
     even, words = spacing(times_s, tick_s) if index.count == len(marks) > 2 else (True, "")
@@ -285,9 +285,9 @@ def _uneven_times(index: PacketIndex, tick: Fraction | None) -> tuple[Stamps | N
 
 
 def _stated_frames(path: Path, container: av.container.InputContainer, count: int, end_s: float) -> int:
-    """Return how many frames the header states; 0 without, or if not more than there are."""
+    """Return the number of frames by the header; 0 without, or if not more than the file holds."""
     stream = container.streams.video[0]
-    if stream.frames > count:  # an edit list hides frames of a movie that was cut without encoding
+    if stream.frames > count:  # an edit list hides frames of a movie cut without encoding
         with av.open(str(path), options={"ignore_editlist": "1"}) as whole, suppress(av.FFmpegError):
             count = sum(bool(packet.size) for packet in whole.demux(whole.streams.video[0]))
         return int(stream.frames) if count < stream.frames else 0
@@ -295,7 +295,7 @@ def _stated_frames(path: Path, container: av.container.InputContainer, count: in
     if not (matroska and container.duration and stream.average_rate):
         return 0
     rate = float(stream.average_rate)
-    # The end counts for unevenly spaced frames, the number for several frames in a step of their stamps.
+    # Use the end for unevenly spaced frames, the number for several frames per step of stamps.
     missing = min(container.duration * rate / av.time_base - count, (container.duration / av.time_base - end_s) * rate)
     return count + round(missing) if missing > SLACK else 0
 
@@ -312,7 +312,7 @@ def grey_dtype(pixel_format: av.VideoFormat) -> np.dtype[Any]:
 
 
 def check_format(name: str, pixel_format: av.VideoFormat) -> None:
-    """Refuse pixel formats without exact grey values: no integer grey plane and no colour (MovieError)."""
+    """Refuse pixel formats without exact grey values: neither an integer grey plane nor colour (MovieError)."""
     colour = (pixel_format.is_rgb or pixel_format.has_palette) and not pixel_format.is_bit_stream
     if not (colour or _has_grey_plane(pixel_format)):
         do = "convert it, lossless: ffmpeg -i MOVIE -c:v ffv1 -pix_fmt gray MOVIE.mkv"
@@ -323,7 +323,7 @@ def grey_values(frame: av.VideoFrame) -> Grey:
     """Return the first plane of grey and YUV frames unchanged, the luma of RGB frames; (H, W), row 0 on top."""
     if _has_grey_plane(frame.format):
         return _plane_0(frame)
-    # FFmpeg only interleaves the channels here: its grey formula differs from that of the other formats.
+    # FFmpeg only interleaves the channels here; its grey formula differs from that of other formats.
     deep = grey_dtype(frame.format).itemsize == 2
     interleaved = frame.reformat(format="rgb48le" if deep else "rgb24")
     values = _plane_0(interleaved, samples=3).reshape(frame.height, frame.width, 3)
@@ -343,11 +343,11 @@ def _plane_0(frame: av.VideoFrame, samples: int = 1) -> Grey:
     plane, height, width = frame.planes[0], frame.height, frame.width * samples
     dtype = grey_dtype(frame.format)
     stored = dtype.newbyteorder(">" if frame.format.is_big_endian else "<")
-    # Rows are padded to line_size, negative for pictures stored bottom-up: buffer_ptr is then the top row, the last in
-    # memory. Read by address: PyAV releases differ in where their buffer begins.
+    # Rows are padded to line_size, negative for pictures stored bottom-up: then buffer_ptr is the top row, the last in
+    # memory. Read by address: the start of PyAV's buffer differs between releases.
     reach = (height - 1) * plane.line_size
     size = abs(reach) + width * dtype.itemsize
     memory = memoryview((ctypes.c_uint8 * size).from_address(plane.buffer_ptr + min(reach, 0))).cast("B")
     strides = (plane.line_size, dtype.itemsize)
     rows: Grey = np.ndarray((height, width), stored, buffer=memory, offset=max(-reach, 0), strides=strides)
-    return rows.astype(dtype, order="C")  # a copy: the memory belongs to the frame
+    return rows.astype(dtype, order="C")  # a copy, as the memory belongs to the frame

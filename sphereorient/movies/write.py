@@ -15,10 +15,10 @@ from sphereorient.movies.movie import Grey, movie_error
 Times = NDArray[np.float64] | Sequence[float]
 WRITERS = (".mkv", ".h5", ".hdf5")
 PIXEL_FORMATS = {np.dtype(np.uint8): "gray", np.dtype(np.uint16): "gray16le"}
-# Every frame a key frame, with check sums: any frame can be read alone, and damage stays in its frame.
+# Key frames only, with check sums: each frame can be read alone, and damage affects one frame.
 FFV1_OPTIONS = {"level": "3", "g": "1", "slicecrc": "1"}
-# Of many slices only those that hold the ball are decoded; they cost 1.5 % of the file.
-SLICES, SLICED_PX = "24", 96  # and the least side of a picture that is cut into so many
+# With many slices, only those with the ball are decoded; they add 1.5 % to the file.
+SLICES, SLICED_PX = "24", 96  # number of slices; least side of a picture with so many
 
 
 def write_movie(
@@ -28,10 +28,10 @@ def write_movie(
     frame_rate_hz: float = 25.0,
 ) -> int:
     """Write grey frames (H, W), uint8 or uint16, as FFV1 (.mkv) or HDF5 (.h5, .hdf5); return their number.
-    A frame None keeps its number: unreadable in HDF5, black in .mkv. `times_s` (N,), s, are written last, into HDF5, or
-    beside the .mkv into `MOVIE.times.csv`, for `times:` of experiment.yaml; players alone use `frame_rate_hz` of .mkv.
-    Raises MovieError: another suffix, no frame, or frames of different size or type; OutputError: the file cannot be
-    written; an old file is kept.
+    A frame None keeps its number: unreadable in HDF5, black in .mkv. `times_s` (N,), s, go into HDF5, or beside the
+    .mkv into `MOVIE.times.csv`, for `times:` of experiment.yaml; only players use `frame_rate_hz` of .mkv. Raises
+    MovieError: another suffix, no frame, or frames of different size or type; OutputError: the file cannot be written;
+    an old file is kept.
     """
     path = Path(path)
     if path.suffix.lower() not in WRITERS:
@@ -47,7 +47,7 @@ def write_movie(
 
 
 def times_path(path: Path) -> Path:
-    """Return where the times of an .mkv are written."""
+    """Return the path of the times of an .mkv."""
     return path.with_suffix(".times.csv")
 
 
@@ -104,7 +104,7 @@ def _write_hdf5(aside: Path, path: Path, frames: Iterable[Grey | None], times_s:
 
 
 def _checked(path: Path, frames: Iterable[Grey | None]) -> tuple[int, Grey, Iterator[Grey | None]]:
-    """Return how many leading frames are None, the first picture, and all frames from it on, checked one by one."""
+    """Return the number of leading None, the first picture, and all frames from it on, checked one by one."""
     rest = iter(frames)
     dead = 0
     for picture in rest:
@@ -124,5 +124,5 @@ def _alike(path: Path, number: int, first: Grey, frames: Iterable[Grey | None]) 
     for at, picture in enumerate(frames, start=number):
         if picture is not None and (picture.shape != first.shape or picture.dtype != first.dtype):
             expected, got = f"{first.shape} of {first.dtype}", f"{picture.shape} of {picture.dtype}"
-            raise movie_error(f"{path}, frame {at}", expected, got, "make them alike")
+            raise movie_error(f"{path}, frame {at}", expected, got, "make them equal in size and type")
         yield picture

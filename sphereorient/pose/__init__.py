@@ -1,4 +1,4 @@
-"""The measuring model of a picture, and the fit: pixels, model, lights, fit, implicit derivative."""
+"""The measuring model of a picture, and the fit of poses: pixels, model, lights, fit, implicit derivative."""
 
 from sphereorient.pose.camera_view import CameraView, Optics, base_table
 from sphereorient.pose.fitter import Fitter

@@ -1,4 +1,4 @@
-"""What the fits need of each camera, and the paint as its pictures blur it."""
+"""What a fit needs of each camera, and the texture map blurred as in its pictures."""
 
 import math
 from collections.abc import Sequence
@@ -18,18 +18,18 @@ from sphereorient.locate.background import Picture
 from sphereorient.pose.pixels import LinesOfSight, Pixels, Stencil, cut_pixels, disk_stencil, stacked, window_of
 from sphereorient.sphere.texture_table import BASE_RAD, SIDE, TextureTable, texture_table
 
-RIM = 2.5  # standard deviations of the blur beyond the limb to which pixels are looked at
+RIM = 2.5  # standard deviations of the blur: pixels this far beyond the limb are fitted
 SIZES = 1.06  # ratio of neighbouring stencil sizes
-FINEST_PX = 0.4  # least blur of any picture, px: a pixel alone has 0.29
-COARSE, MIDDLE = 0.07, 0.03  # blur laid over a picture before a coarse fit, in radii of the disk
-SOFT, SOFT_PX = 0.06, 1.5  # radii, px: templates of pictures that are blurred by more than both are blurred as well
-FINER_SIDES = 2  # of the usual table, for disks of over 100 px: 16 MB
-FIRST_BLUR_PX = 0.625  # first blur of sharp pictures: a pixel's own width and a good lens
+FINEST_PX = 0.4  # least blur of any picture, px; that of the pixel alone is 0.29
+COARSE, MIDDLE = 0.07, 0.03  # blur added to a picture before a coarse fit, in radii of the disk
+SOFT, SOFT_PX = 0.06, 1.5  # radii, px: templates are blurred too if the pictures have more blur than both
+FINER_SIDES = 2  # of the usual table, for disks above 100 px; 16 MB
+FIRST_BLUR_PX = 0.625  # assumed at first: pixel width and a good lens
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraView(CameraScene):
-    """One calibrated camera and its movie's empty scene; made by the pipeline, read by the fits."""
+    """One calibrated camera and its movie's empty scene."""
 
     name: str
     camera: Camera
@@ -46,7 +46,7 @@ class CameraView(CameraScene):
 
     @property
     def scene(self) -> CameraScene:
-        """What is known of the camera's movie."""
+        """Background, response and masks of the camera's movie."""
         return CameraScene(**{part.name: getattr(self, part.name) for part in fields(CameraScene)})
 
     @cached_property
@@ -59,11 +59,11 @@ class CameraView(CameraScene):
 
     @cached_property
     def plain(self) -> bool:
-        """Whether pictures are their own light, and lines of sight those of a camera that is not a fisheye."""
+        """Whether grey levels are proportional to light and the camera is not a fisheye."""
         return (self.response is None or self.response.linear) and not self.sight.wide
 
     def light(self, picture: Picture, window: tuple[int, int, int, int]) -> Picture:
-        """Return the light of a picture (H, W) within left, top, right and bottom, included, px; 0 beyond."""
+        """Return the light of a picture (H, W) within left, top, right and bottom, included, px; 0 elsewhere."""
         if self.response is None or self.response.linear:
             return picture
         left, top, right, bottom = window
@@ -77,8 +77,8 @@ class CameraView(CameraScene):
         return sphere_radius_px(self.camera, position_lab_mm, radius_mm)
 
     def smear_px(self, position_lab_mm: Tensor, moved: Tensor, radius_mm: float) -> Tensor:
-        """Return how far the middle of the disk moves in the picture, (B,), px, of spheres at (B, 3), mm.
-        `moved` (B, 6): turn (rad) and move (mm) of the sphere while the shutter is open.
+        """Return the motion (B,), px, of the disk's middle during the exposure, of spheres at (B, 3), mm.
+        `moved` (B, 6): rotation (rad) and displacement (mm) during the exposure.
         """
         centre = perspective_centre_lab_mm(self.camera, position_lab_mm)
         sight = torch.nn.functional.normalize(position_lab_mm - centre, dim=-1)
@@ -88,25 +88,25 @@ class CameraView(CameraScene):
         return smear
 
     def shows_whole(self, centre_px: Tensor, radius_px: Tensor) -> Tensor:
-        """Return whether the picture holds the whole disk, (...) bool, of centres (..., 2) and radii (...), px."""
+        """Return whether the whole disk lies in the picture, (...) bool, for centres (..., 2) and radii (...), px."""
         return holds_disk(self.camera, centre_px, radius_px)
 
 
 def widest_px(views: Sequence[CameraView]) -> float:
-    """Return the expected diameter of the sphere, px, in the camera that sees it largest."""
+    """Return the largest expected diameter of the sphere in any camera, px."""
     return max(view.diameter_px for view in views)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PyramidLevel:
-    """One width of detail: what is laid over the picture, which pixels are looked at, the paint as blurred."""
+    """One level of detail: the blur added to the picture, the pixels fitted, the blurred texture map."""
 
     extra_px: float
     blur_px: float  # of the limb
     paint: TextureTable
 
     def stencil(self, radius_px: float) -> Stencil:
-        """Return the places of a disk of some radius."""
+        """Return the stencil of a disk of a given radius."""
         return disk_stencil(radius_px + RIM * self.blur_px, max(1, round(self.extra_px)), self.blur_px)
 
 
@@ -114,8 +114,8 @@ Steps = Sequence[tuple[PyramidLevel, int, int]]  # of a fit: level, every n-th p
 
 
 class Optics:
-    """Texture tables at the levels of blur of the fits: paint of blur `blur_px` on disks of `diameter_px`, px, and the
-    blur of the limb, None: the same. A map that is not sharp, or disks of other sizes, show as blur of the paint alone.
+    """Texture tables at the blur levels of the fits: paint of blur `blur_px` on disks of `diameter_px`, px, and the
+    limb's blur (None: the same). An unsharp map and disks of different sizes blur the paint alone.
     """
 
     def __init__(
@@ -125,10 +125,10 @@ class Optics:
         self._radius_px = diameter_px / 2
         self.fine = level_of(base, blur_px, 0.0, self._radius_px, limb_blur_px)
 
-    # Each from the one before: a wider blur allows a smaller table.
+    # Each is blurred from the previous one: a wider blur allows a smaller table.
     @cached_property
     def middle(self) -> PyramidLevel:
-        """The level of a fit that is right to a few degrees."""
+        """The level of a fit from poses that are right to a few degrees."""
         return self._blurred(self.fine.paint, MIDDLE)
 
     @cached_property
@@ -154,7 +154,7 @@ class Optics:
 
     @property
     def steps(self) -> Steps:
-        """The steps of a fit from poses that are roughly right to all detail."""
+        """The steps of a fit from roughly right poses to full detail."""
         return (self.coarse, 1, 4), (self.middle, 1, 3), (self.fine, 1, 4)
 
     def to(self, device: torch.device) -> "Optics":
@@ -169,17 +169,15 @@ class Optics:
 def level_of(
     base: TextureTable, blur_px: float, extra_px: float, radius_px: float, limb_blur_px: float | None = None
 ) -> PyramidLevel:
-    """Return the level at which `extra_px` of blur are laid over pictures of blur `blur_px`; that of the limb: as
-    `Optics`.
-    """
+    """Return the level with `extra_px` of blur added to pictures of blur `blur_px`; limb as in `Optics`."""
     limb_px = math.hypot(blur_px if limb_blur_px is None else limb_blur_px, extra_px)
     paint = base.blurred(math.hypot(blur_px, extra_px) / radius_px)
     return PyramidLevel(extra_px=extra_px, blur_px=limb_px, paint=paint)
 
 
 def base_table(texture: Tensor, diameter_px: float, unseen: Tensor | None = None) -> TextureTable:
-    """Return the finest table of a map that disks of some diameter resolve; all others are blurred from it.
-    `unseen` (H, 2 H) bool: texels that are no paint.
+    """Return the finest table of a map that disks of this diameter resolve; all others are blurred from it.
+    `unseen` (H, 2 H) bool: texels without known paint.
     """
     blur_rad = max(FINEST_PX * 2 / diameter_px, BASE_RAD / FINER_SIDES)
     finer = 1 << max(0, math.ceil(math.log2(BASE_RAD / blur_rad)))  # large disks resolve smaller cells
@@ -192,7 +190,7 @@ def size_steps(ratio: float) -> int:
 
 
 def defocus_radii(blur_px: float, diameter_px: float) -> float:
-    """Return the blur of pictures, radii, as the search needs it: 0 unless they are defocused."""
+    """Return the blur of pictures in radii, for the search: 0 unless they are defocused."""
     blur = 2 * blur_px / diameter_px
     return blur if blur > SOFT and blur_px > SOFT_PX else 0.0
 
@@ -202,10 +200,10 @@ class FrameDisks:
     """The disks of B spheres in the frames of C cameras; made by `FrameDisks.of`."""
 
     views: Sequence[CameraView]  # C
-    frames: Sequence[Sequence[Picture]]  # B of C, light, decoded at least where the disks are
+    frames: Sequence[Sequence[Picture]]  # B of C, light; decoded at least at the disks
     middle_px: Tensor  # (C, B, 2)
     stencil: Stencil
-    hidden: Tensor | None  # (B * C, P) bool, places that do not count; None: all count
+    hidden: Tensor | None  # (B * C, P) bool, places not used; None: all are used
 
     @classmethod
     def of(
@@ -217,7 +215,7 @@ class FrameDisks:
         hidden: Tensor | None = None,
         blur_px: float = 0.0,
     ) -> "FrameDisks":
-        """Decode what the disks about `middle_px` and a blur laid over them read of the pictures."""
+        """Decode the pixels that disks about `middle_px`, with an added blur, read."""
         middles = middle_px.nan_to_num().tolist()
 
         def window(b: int, c: int) -> tuple[int, int, int, int]:
@@ -225,7 +223,7 @@ class FrameDisks:
 
         for b, row in enumerate(pictures):
             for c, frame in enumerate(row):
-                if isinstance(frame, OnDemand):  # all of them, before the first is waited for
+                if isinstance(frame, OnDemand):  # request all before waiting for the first
                     frame.ask(*window(b, c))
         frames = []
         for b, row in enumerate(pictures):
@@ -237,7 +235,7 @@ class FrameDisks:
         return cls(views=views, frames=frames, middle_px=middle_px, stencil=stencil, hidden=hidden)
 
     def pixels(self, blur_px: float = 0.0) -> Pixels:
-        """Return the pixels of the B * C disks, with a blur laid over the frames."""
+        """Return the pixels of the B * C disks, with a blur added to the frames."""
         middles = self.middle_px.nan_to_num().tolist()
         pixels = stacked(
             [

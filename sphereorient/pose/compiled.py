@@ -1,5 +1,5 @@
-"""Who computes a fit of poses, and residuals: compiled code, refine.c, where it was built, on the CPU in float; else
-torch (fit.py, residuals.py), which defines them and has gradients.
+"""Fits of poses and residuals by compiled code (refine.c) where it was built, on the CPU in float; otherwise by torch
+(fit.py, residuals.py), which defines them and has gradients.
 """
 
 import ctypes
@@ -31,14 +31,14 @@ from sphereorient.pose.residuals import EDGE_PX, KNOWN, NOISE_MIN, OUTLIERS, TUK
 from sphereorient.pose.view import COVER_MIN, DEPTH_MIN, exposure_instants, limb_shape, rim_shape
 
 EDGES, EDGE_MOST = 1537, 6.0  # of a table over the distance of the limb in standard deviations of the blur
-EDGE_FAR = 4.0  # farther inside, the limb cuts nothing off; farther outside all, and no paint is looked up
+EDGE_FAR = 4.0  # farther inside, coverage is 1; farther outside it is 0, and no paint is looked up
 READABLE = {np.dtype(name) for name in ("uint8", "uint16", "float32")}  # pixels, in this machine's order of bytes
 SOURCE = Path(__file__).with_name("refine")
 _Table, _Task, _Stencil, _Scene, _Shot, Near = (
     record(SOURCE, name) for name in ("Table", "Task", "Stencil", "Scene", "Shot", "Near")
 )
 _RESULTS = [field[0] for field in _Task._fields_[-len(POSE_PARTS) :]]
-# What `linearise` tells of each place, in this order, with their numbers.
+# What `linearise` returns for each place, in this order, with the number of values.
 COLUMNS = {"paint": 1, "coverage": 1, "across": 2, "aside": 1, "outward": 3, "paint_by_rotation": 3}
 COLUMNS |= {"paint_by_position": 3, "coverage_by_position": 3, "count": 1, "difference": 1, "black": 1, "beside": 1}
 COLUMNS |= {"residual": 1, "variance": 1, "lit": 1, "model": 1, "weight": 1}
@@ -46,7 +46,7 @@ OF_VIEW, OF_FIT = tuple(COLUMNS)[:8], ("residual", "model", "variance", "weight"
 
 
 def refine_library() -> ctypes.CDLL | None:
-    """Return the compiled code for this processor; None where there is none."""
+    """Return the compiled code for this processor; None if there is none."""
     return compiled(SOURCE, Near)
 
 
@@ -63,14 +63,14 @@ def refine_compiled(
 
 
 def kept_compiled(pixels: Pixels, begin: PoseStart, model: SphereModel, most: float) -> Tensor:
-    """Return the places that count, as `fit.kept`."""
+    """Return the places that are used, as `fit.kept`."""
     return _refined(pixels, begin, model, 0, most)[1]
 
 
 def _refined(
     pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int, most_hidden: float
 ) -> tuple[FittedPoses, Tensor]:
-    """Fit poses, without meaning where there are no iterations; return also the places that count."""
+    """Fit poses, undefined without iterations; return also the places that are used."""
     kept = torch.empty_like(pixels.inside)
     task, _alive = _task_on(pixels, begin, model)
     task.iterations, task.most_hidden, task.kept = iterations, most_hidden, kept.data_ptr()
@@ -82,7 +82,7 @@ def _refined(
 def residuals_compiled(
     pixels: Pixels, X: Tensor, R: Tensor, state: tuple[Tensor, Tensor] | None, model: SphereModel
 ) -> Residuals:
-    """Linearise pictures as `residuals.residuals`, by compiled code where that is able to; it has no gradients."""
+    """Linearise pictures as `residuals.residuals`, by compiled code where possible; it has no gradients."""
     cameras = len(model.light.noise)
     begin = PoseStart(X, R, torch.ones(len(X), cameras, dtype=torch.bool))
     if body_of(X) is IN_TORCH or pixels.grey.dtype != torch.float32:
@@ -111,13 +111,13 @@ def residuals_compiled(
 
 
 def fitted_residuals(pixels: Pixels, fit: FittedPoses, model: SphereModel) -> Residuals:
-    """Linearise the pictures of B * C disks about fitted poses, with weights that no bubble has set."""
+    """Linearise the pictures of B * C disks about fitted poses, with weights from the fitted pose."""
     at = residuals_compiled(pixels, fit.position_lab_mm, fit.R_lab_body, None, model)
     return residuals_compiled(pixels, fit.position_lab_mm, fit.R_lab_body, (at.model, at.weight), model)
 
 
 def _task_on(pixels: Pixels, begin: PoseStart, model: SphereModel) -> tuple[ctypes.Structure, "_Addresses"]:
-    """Return a record of pixels that are cut out, with model and start."""
+    """Return a record of disks' pixels, model and start."""
     L, P = pixels.grey.shape
     task, at = _task_of(begin, model, pixels.instants)
     task.disks, task.places, task.inner = L, P, pixels.inner
@@ -130,7 +130,7 @@ def _task_on(pixels: Pixels, begin: PoseStart, model: SphereModel) -> tuple[ctyp
 
 
 def _task_of(begin: PoseStart, model: SphereModel, instants: int) -> tuple[ctypes.Structure, "_Addresses"]:
-    """Return a record with model, exposure and start of fits, and what it points to."""
+    """Return a record of model, exposure and start of fits, and what it points to."""
     of_model, known = _of_model(model)
     at, (instant, share) = _Addresses(known), _quadrature(instants)
     task = _Task.from_buffer_copy(of_model)
@@ -141,7 +141,7 @@ def _task_of(begin: PoseStart, model: SphereModel, instants: int) -> tuple[ctype
 
 
 def _into(task: ctypes.Structure, use: Tensor) -> FittedPoses:
-    """Return poses that a task writes: its last fields, in the order of `FittedPoses`."""
+    """Return the poses that a task writes: its last fields, in the order of `FittedPoses`."""
     parts = pose_arrays(use.shape[1], len(use))
     for name, part in zip(_RESULTS, parts.values(), strict=True):
         setattr(task, name, part.data_ptr())
@@ -149,7 +149,7 @@ def _into(task: ctypes.Structure, use: Tensor) -> FittedPoses:
 
 
 def _run(name: str, task: ctypes.Structure, poses: int) -> None:
-    """Let a function of compiled code do the work of B poses, on all cores."""
+    """Run a function of compiled code on B poses, on all cores."""
     code = refine_library()
     assert code is not None  # as `body_of` asked
     work = getattr(code, name)
@@ -165,7 +165,7 @@ def _run(name: str, task: ctypes.Structure, poses: int) -> None:
 
 
 def disks_compiled(views: Sequence[CameraView], position_lab_mm: Tensor, radius_mm: float) -> tuple[Tensor, Tensor]:
-    """Return middles (C, B, 2) and radii (C, B), px, of disks, as `fit.disks` to 0.02 px, by lines of sight."""
+    """Return middles (C, B, 2) and radii (C, B), px, of disks, as `fit.disks` to 0.02 px, from lines of sight."""
     code, at = refine_library(), _Addresses()
     assert code is not None  # as `body_of` asked
     found = torch.empty(len(views), len(position_lab_mm), 3, dtype=torch.float64)
@@ -214,7 +214,7 @@ def settle_alone(
     most_hidden: float,
     radius_mm: float,
 ) -> FittedPoses:
-    """Fit one pose to the frames of C cameras by one call, as `Fitter.settled` does."""
+    """Fit one pose to the frames of C cameras in one call, as `Fitter.settled`."""
     code, cameras = refine_library(), len(views)
     assert code is not None  # as `body_of` asked
     near, _alive = _alone(tuple(views), model, stencil, instants, most_hidden, radius_mm)
@@ -246,7 +246,7 @@ def _alone(
     most_hidden: float,
     radius_mm: float,
 ) -> tuple[ctypes.Structure, tuple[object, ...]]:
-    """Return the record of `settle_alone` but for the pose and its frames, and what it points to."""
+    """Return the record of `settle_alone` without pose and frames, and what it points to."""
     nowhere = PoseStart(torch.zeros(1, 3), torch.zeros(1, 3, 3), torch.zeros(1, len(views), dtype=torch.bool))
     near, at, alive = _near(views, nowhere, model, stencil, instants, most_hidden)
     near.radius_mm, near.hopeless, near.again = radius_mm, in_torch.HOPELESS, in_torch.AGAIN
@@ -257,7 +257,7 @@ def _alone(
 def _near(
     views: Sequence[CameraView], begin: PoseStart, model: SphereModel, stencil: Stencil, instants: int, hidden: float
 ) -> tuple[Any, "_Addresses", object]:
-    """Return the record of fits but for their frames, with what gives further addresses and what else it points to."""
+    """Return the record of fits without frames, the addresses to extend, and what else it points to."""
     task, at = _task_of(begin, model, instants)
     some, more = in_torch.further_steps(model)
     near = Near(task=task, some_more=some, all_more=more, near_rad=model.near_rad, most_hidden=hidden)
@@ -269,15 +269,15 @@ def _near(
 
 
 class _Addresses:
-    """Addresses of tensors as C reads them; each lives as long as this."""
+    """Addresses of tensors for C; the tensors live as long as this object."""
 
     def __init__(self, *others: "_Addresses") -> None:
-        # The others too: another thread may push them out of the cache that holds them.
+        # Hold the others too: another thread may remove them from the cache.
         self._others = others
         self._alive: list[Tensor] = []
 
     def __call__(self, part: Tensor | None, dtype: torch.dtype | None = None) -> int | None:
-        """Return where the numbers of a tensor lie, in their order; None of None."""
+        """Return the address of a contiguous tensor; None for None."""
         if part is None:
             return None
         part = part if dtype is None or part.dtype == dtype else part.to(dtype)
@@ -306,7 +306,7 @@ def _of_stencil(stencil: Stencil) -> ctypes.Structure:
 
 @lru_cache(maxsize=16)
 def _of_model(model: SphereModel) -> tuple[ctypes.Structure, _Addresses]:
-    """Return a record with all that depends on the model alone, and what it points to."""
+    """Return a record of all that depends on the model alone, and what it points to."""
     at, lit, light, paint, unseen = _Addresses(), model.light, model.light.tables, model.paint, model.paint.unseen
     pointers = {"edge": _edge_table(), "light": light.cells, "cover": light.cover, "gain": light.gain}
     pointers |= {"noise": lit.noise, "stray": lit.stray, "limb_px": model.limb_px}
@@ -348,7 +348,7 @@ def _quadrature(instants: int) -> tuple[Tensor, Tensor]:
 
 @cache
 def _edge_table() -> Tensor:
-    """Return how the limb cuts an aperture at `EDGES` distances from -EDGE_MOST to EDGE_MOST, (n, 16) float32."""
+    """Return the limb's cut of an aperture at `EDGES` distances from -EDGE_MOST to EDGE_MOST, (n, 16) float32."""
     edge = torch.linspace(-EDGE_MOST, EDGE_MOST, EDGES, dtype=torch.float64)
     coverage, density, pull, variance = limb_shape(edge)
     z, moves = rim_shape(coverage[None], density[None])
@@ -356,7 +356,7 @@ def _edge_table() -> Tensor:
 
 
 class Body(NamedTuple):
-    """The functions of a fit; as those of `fit`."""
+    """The functions of a fit, as in `fit`."""
 
     disks: Callable[[Sequence[CameraView], Tensor, float], tuple[Tensor, Tensor]]
     refine: Callable[[Pixels, PoseStart, SphereModel, int, float], FittedPoses]
@@ -369,7 +369,7 @@ COMPILED = Body(disks_compiled, refine_compiled, kept_compiled, settle_compiled)
 
 
 def body_of(position_lab_mm: Tensor) -> Body:
-    """Return the body for spheres there."""
+    """Return the functions for spheres at these positions."""
     X = position_lab_mm
     able = refine_library() is not None and X.device.type == "cpu" and not X.requires_grad
     return COMPILED if able else IN_TORCH

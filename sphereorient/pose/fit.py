@@ -1,5 +1,5 @@
-"""Pose to hundredths of a degree: Gauss-Newton on rotation and position, all cameras at once, light eliminated; without
-the pixels of what covers the sphere (bubbles, specks, a rod, an unknown glint): connected residuals.
+"""Pose to hundredths of a degree: Gauss-Newton on rotation and position of all cameras at once, light eliminated.
+Pixels of occluders (bubbles, specks, a rod, an unknown glint) are found as connected large residuals and not used.
 """
 
 import math
@@ -34,34 +34,34 @@ from sphereorient.so3 import inverse_damped, solve_damped
 Singles = NDArray[np.float32]
 Indices = NDArray[np.int64]
 
-WINDOW_PX = 5  # over which squared residuals are averaged: noise of single pixels does not reach the limit
-MOST_EACH = 25.0  # that one pixel counts, variances: a single outlier is no occluder, robust weights drop it
-# Mean of a window, in variances of the disk's own scatter. Of paint whose light is learnt: 5 to 8 at most, along edges
-# and the limb; of bubbles and specks, 16 to 25.
+WINDOW_PX = 5  # over which squared residuals are averaged: noise of single pixels stays below the limit
+MOST_EACH = 25.0  # limit of one pixel's square, variances: a single outlier is no occluder; robust weights remove it
+# Mean of a window, in variances of the disk's residuals: at most 5 to 8 for paint with learnt light, along edges and
+# the limb; 16 to 25 for bubbles and specks.
 COVERED = 10.0
 LEAST_OF_WINDOW = 0.5 * WINDOW_PX**2  # pixels
-MARGIN_PX = 3  # about such windows' middles: the occluder's blurred border
-MOST_HIDDEN = 0.5  # of a disk; where more differs, its pose or light is wrong, and all pixels count
-# In half of the pictures: bubbles 0.03, a rod 0.07, a map warped by 3 degrees 0.22. Then the model is wrong in all.
+MARGIN_PX = 3  # around the middles of such windows: the occluder's blurred border
+MOST_HIDDEN = 0.5  # of a disk; if more differs, pose or light is wrong, and all pixels are used
+# Share in half of the pictures: bubbles 0.03, a rod 0.07, a map warped by 3 degrees 0.22. Above: the model is wrong.
 USUALLY_HIDDEN = 0.15
-# The longest steps that are not long: rad; of the blur at the disk's middle; of one so narrow, px, that edges fall
-# between the pixels: robust weights then leave out what is off by a pixel, and steps fall short.
+# Longest steps of a settled fit: rad; blurs at the disk's middle; blurs below NARROW_PX. With so narrow a blur edges
+# fall between pixels: robust weights drop what is off by a pixel, and steps are too short.
 NEAR_RAD, NEAR_BLURS, NEAR_NARROW, NARROW_PX = 0.006, 0.4, 0.15, 0.5
-FIRST_EVERY = 4  # the first step of a fit looks at every fourth pixel
-MORE = 2, 3  # further iterations after a long step: of some pixels, of all
-AGAIN = 3  # times that a fit whose last step is long goes on
-HOPELESS = 0.2  # score of one that does not: far away from any pose
+FIRST_EVERY = 4  # the first step of a fit uses every fourth pixel
+MORE = 2, 3  # further iterations after a long step: with some pixels, with all
+AGAIN = 3  # repetitions of a fit whose last step is long
+HOPELESS = 0.2  # score below which a fit is not repeated: far from any pose
 
 
 def occluded(pixels: Pixels, expected: Tensor, noise: Tensor, counted: Tensor, most: float) -> Tensor:
-    """Return the pixels that something before the sphere shows, (L, P) bool.
+    """Return the pixels that show something in front of the sphere, (L, P) bool.
 
     Args:
         pixels: of L disks, all places of their stencil.
         expected: grey levels by the model, (L, P).
         noise: coefficients of the noise's variance, (L, 4); see `Light`.
-        counted: (L, P) bool, pixels whose residuals tell something.
-        most: share of a disk; where more of it differs, no pixel of it is returned.
+        counted: (L, P) bool, pixels with valid residuals.
+        most: share of a disk; if more of it differs, none of its pixels is returned.
     """
     residual = pixels.grey - expected
     variance = noise_variance(expected, noise)
@@ -76,7 +76,7 @@ def occluded(pixels: Pixels, expected: Tensor, noise: Tensor, counted: Tensor, m
 
 
 def kept(pixels: Pixels, begin: PoseStart, model: SphereModel, most: float) -> Tensor:
-    """Return the places of B * C disks that count, (B * C, P) bool, without those of occluders by the poses given."""
+    """Return the used places of B * C disks, (B * C, P) bool, without occluders at the given poses."""
     at = residuals(pixels, begin.position_lab_mm.double(), begin.R_lab_body.double(), None, model)
     counted = at.inside & ~pixels.clipped
     hidden = occluded(pixels, at.model, model.light.noise.repeat(len(begin.use), 1), counted, most)
@@ -89,7 +89,7 @@ def _covered(differs: Singles, counted: Singles, down: Indices, right: Indices) 
     grids[:, down, right] = differs, counted
     window = (WINDOW_PX, WINDOW_PX)
     sums = [cv2.boxFilter(grid, cv2.CV_32F, window, normalize=False, borderType=cv2.BORDER_CONSTANT) for grid in grids]
-    # At the border of the stencil a few pixels are no window.
+    # Windows at the stencil's border have too few pixels.
     seeds = sums[0] > COVERED * np.maximum(sums[1], LEAST_OF_WINDOW)
     about = np.ones((2 * MARGIN_PX + 1, 2 * MARGIN_PX + 1), np.uint8)
     covered: NDArray[np.bool_] = cv2.dilate(seeds.astype(np.uint8), about)[down, right] > 0
@@ -103,13 +103,13 @@ def _array(part: Tensor) -> Singles:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Last:
-    """The last step of a fit of B poses, cameras c of C."""
+    """The last step of a fit of B poses in C cameras."""
 
     step: Tensor  # (B, 6)
-    whole: Tensor  # (B, 6, 6), information of all cameras in use and of the prior position
+    whole: Tensor  # (B, 6, 6), information by all cameras in use and the prior position
     information: Tensor  # (B, C, 6, 6)
     pull: Tensor  # (B, C, 6)
-    shared: Tensor  # (B, C, 6, 6), scores of tiles
+    shared: Tensor  # (B, C, 6, 6), from the scores of tiles
     to_centre: Tensor  # (B, C, 3), mm, from the camera, after the step
     paint_step: Tensor  # (B, C), median grey levels from black to white paint
 
@@ -118,9 +118,9 @@ def refine(
     pixels: Pixels, begin: PoseStart, model: SphereModel, iterations: int = 4, most_hidden: float = 0.0
 ) -> FittedPoses:
     """Fit poses to pictures: robust Gauss-Newton, the light's coefficients eliminated in every step.
-    `pixels` holds B * C disks, the cameras of a pose next to each other; `iterations` is at least 1. Pixels that an
-    occluder shows by the first pose are not used; `most_hidden`: share of a disk, see `occluded`. The covariance is
-    robust, with errors shared within tiles. All results but the pose belong to the pose before the last step.
+    `pixels` holds B * C disks, the cameras of a pose side by side; `iterations` is at least 1. Pixels of occluders at
+    the first pose are not used; `most_hidden`: share of a disk, see `occluded`. The covariance is robust, with errors
+    shared within tiles. All results but the pose belong to the pose before the last step.
     Source: variable projection, Golub and Pereyra 1973; covariance from clustered scores, Liang and Zeger 1986.
     """
     cameras, seen = begin.use.shape[1], begin.use.double()
@@ -143,8 +143,8 @@ def refine(
         step = _bounded(solve_damped(whole, force), X[:, None] - origin, seen, model.radius_mm)
         R = so3.exp(step[:, :3]) @ R
         X = X + step[:, 3:]
-    tiles = tile_scores(at, mixed, pixels.tile)  # errors of neighbours are dependent
-    # Residuals of a fit are smaller than errors: the correction for few clusters (Cameron and Miller 2015, CR1).
+    tiles = tile_scores(at, mixed, pixels.tile)  # errors of neighbouring pixels are correlated
+    # Residuals are smaller than errors: correction for few clusters (Cameron and Miller 2015, CR1).
     few = tiles.shape[2] / max(tiles.shape[2] - 6 - sum(model.shading.counts), 1)
     last = _Last(
         step=step,
@@ -168,7 +168,7 @@ def refine(
 
 
 def _by_each(last: _Last, radius_mm: float) -> dict[str, Tensor]:
-    """Return what each camera alone says beside the pose; see `FittedPoses`."""
+    """Return the estimates by each camera alone; see `FittedPoses`."""
     information, pull, step, shared = last.information, last.pull, last.step, last.shared
     by_move = (information[..., :3, 3:] @ step[:, None, 3:, None])[..., 0]
     turn = solve_damped(information[..., :3, :3], pull[..., :3] - by_move) - step[:, None, :3]
@@ -190,13 +190,13 @@ def _by_each(last: _Last, radius_mm: float) -> dict[str, Tensor]:
 
 
 def _covariance(last: _Last, pixels: Pixels, begin: PoseStart, model: SphereModel) -> Tensor:
-    """Return the covariance of the poses, (B, 6, 6): by the scores of tiles, the limb's place, and stray light."""
+    """Return the covariance of the poses, (B, 6, 6), from the scores of tiles, the limb's position, and stray light."""
     cameras, seen, to_centre = begin.use.shape[1], begin.use.double(), last.to_centre
     meat = (last.shared * seen[..., None, None]).sum(1)
-    if begin.place_precision is not None:  # the prior position has an error of its own
+    if begin.place_precision is not None:  # the prior position has its own error
         meat[:, 3:, 3:] += begin.place_precision
     bread = inverse_damped(last.whole)
-    # An edge that is a pixel off moves the sphere along each line of sight.
+    # An edge that is off by a pixel moves the sphere along each line of sight.
     distance = to_centre.flatten(0, 1).norm(dim=-1, keepdim=True)
     px_mm = by_pose(pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * distance, cameras)
     edge = to_centre * (px_mm / model.radius_mm) * seen[..., None]
@@ -206,13 +206,13 @@ def _covariance(last: _Last, pixels: Pixels, begin: PoseStart, model: SphereMode
         found = (model.limb_px[:, None].to(lured) * lured).sum(1)[..., None]
         covariance = covariance + found @ found.mT
     finest_mm = px_mm[..., 0].masked_fill(~begin.use, math.inf).amin(1).nan_to_num(0.0, 0.0, 0.0)
-    # By how much stray light, were it unknown, would move the limb: it is not known much better than that.
+    # The limb's shift if stray light were neglected: stray light is hardly known better.
     stray = model.light.stray.double()
     share = stray.square() @ stray.new_tensor([1.0] + [0.5] * (stray.shape[1] - 1))  # mean square over the angle
     aside_px = (model.blur_px * share.sqrt() / last.paint_step.clamp_min(1.0) * seen).amax(1)
     aside_mm = (aside_px * finest_mm)[:, None].expand(-1, 3)
     covariance = covariance + torch.diag_embed(torch.cat([aside_mm / model.radius_mm, aside_mm], dim=1).square())
-    any_seen = (last.whole.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # without a picture the inverse would be huge
+    any_seen = (last.whole.diagonal(dim1=-2, dim2=-1) > 0).all(-1)  # without any picture the inverse is huge
     return torch.where(any_seen[:, None, None], 0.5 * (covariance + covariance.mT), bread)
 
 
@@ -228,14 +228,16 @@ def _bounded(step: Tensor, to_centre: Tensor, seen: Tensor, radius_mm: float) ->
 
 
 def _limb_coverage(at: Residuals, pixels: Pixels, to_centre: Tensor, model: SphereModel) -> Tensor:
-    """Return the share of the limb of L disks whose pixels count, (L,): border, masks, occluders, shadow and unknown
-    paint take some. `to_centre` (L, 3), mm.
+    """Return the share of the limb of L disks whose pixels are used, (L,): picture border, masks, occluders, shadow and
+    unknown paint reduce it. `to_centre` (L, 3), mm.
     """
     limb = (at.view.coverage_by_position.norm(dim=1) * (at.weight > 0)).double().sum(-1)  # 1/mm
     distance = to_centre.norm(dim=-1)
     px_mm = pixels.pitch_mm + pixels.pitch_rad * distance
-    place_px2 = math.pi * float(pixels.place[:, -1].square().sum()) / pixels.place.shape[1]  # one stands for
-    # That of a whole disk on the camera's axis: of a near ball the picture is larger than its angle.
+    place_px2 = (
+        math.pi * float(pixels.place[:, -1].square().sum()) / pixels.place.shape[1]
+    )  # area that one pixel represents
+    # That of a whole disk on the camera's axis: the picture of a near ball is larger than its angle.
     whole = 2 * math.pi * model.radius_mm / px_mm.square() / (1 - (model.radius_mm / distance).square()).square()
     share: Tensor = (place_px2 * limb / whole).clamp_max(1.0)
     return share
@@ -251,8 +253,8 @@ def disks(views: Sequence[CameraView], position_lab_mm: Tensor, radius_mm: float
 def settle(
     disks: FrameDisks, begin: PoseStart, model: SphereModel, instants: int, most_hidden: float, first: bool
 ) -> tuple[FittedPoses, Tensor]:
-    """Fit B poses to their disks; `first`: to every `FIRST_EVERY`-th pixel before.
-    Return also which poses that moved far, (B,) bool: nothing else was done there; the disks are to be cut out anew.
+    """Fit B poses to their disks; `first`: with every `FIRST_EVERY`-th pixel before.
+    Return also which poses moved far, (B,) bool: they are not fitted further; cut their disks out anew.
     """
     pixels = moved_to(begin.R_lab_body.device, disks.pixels().exposed(begin.moved, instants))
     some, more = further_steps(model)
@@ -264,13 +266,13 @@ def settle(
 
 
 def longest_near_rad(blur_px: float, radius_px: float) -> float:
-    """Return the longest step, rad, after which a fit to a disk of this radius and blur, px, has settled."""
+    """Return the longest step, rad, after which a fit to a disk of this radius and blur, px, counts as settled."""
     share = NEAR_BLURS if blur_px > NARROW_PX else NEAR_NARROW
     return min(NEAR_RAD, share * blur_px / max(radius_px, 1.0))
 
 
 def further_steps(model: SphereModel) -> tuple[int, int]:
-    """Return how many further iterations follow a long step, of some pixels and of all: more for a narrower blur."""
+    """Return the numbers of further iterations after a long step, with some pixels and with all."""
     some, more = (math.ceil(count * max(1.0, NEAR_RAD / model.near_rad)) for count in MORE)
     return some, more
 
@@ -278,15 +280,15 @@ def further_steps(model: SphereModel) -> tuple[int, int]:
 def _step(
     pixels: Pixels, begin: PoseStart, model: SphereModel, more: int, most_hidden: float = 0.0
 ) -> tuple[FittedPoses, Tensor]:
-    """Take one step, and `more` from where that one was long; return also where it was, (B,) bool."""
+    """Take one step, and `more` where it was long; return also where it was long, (B,) bool."""
     use = begin.use
     if begin.place_precision is not None and not begin.held:
-        # All cameras together determine the position; for one of two the distance is better known from before.
+        # Two cameras determine the position; for one alone the prior distance is better.
         precision = torch.where(use.all(1)[:, None, None], 0.0, begin.place_precision)
         begin = replace(begin, place_precision=precision)
     fit = refine(pixels, begin, model, 1, most_hidden)
     turn, move = fit.step[:, :3].norm(dim=-1), fit.step[:, 3:].norm(dim=-1)
-    # One camera's distances scatter; a change of its picture shows in the rotation as well.
+    # Distances by one camera scatter; a real change of its picture also changes the rotation.
     far = (turn > model.near_rad) | ((use.sum(1) > 1) & (move > model.near_rad * model.radius_mm))
     if bool(far.any()):
         fit = refine(pixels, begin.after(fit), model, more, most_hidden).where(far, fit)

@@ -32,38 +32,40 @@ from sphereorient.sphere import orthographic_view
 from sphereorient.sphere.texture_table import TextureTable
 
 CPU = torch.device("cpu")
-LEAST_LEFT = 1e-6  # of a picture's variance; rounding leaves more
-DISK_PX = 32  # of the disk on which the share of known paint is counted
+LEAST_LEFT = 1e-6  # least unexplained share of a picture's variance; rounding alone leaves more
+DISK_PX = 32  # diameter of the disk on which the share of known paint is measured
 
 
 class DisksPx(NamedTuple):
-    """Where a sphere's disks lie in the pictures; made by `Fitter.disks_px`."""
+    """Where a sphere's disks lie in the pictures."""
 
     middle_px: Tensor  # (C, B, 2)
-    largest_px: Tensor  # (B,), the largest radius
-    spoilt: Spoilt | None = None  # by other spheres, see `Fitter.spoilt`; None: not known
+    largest_px: Tensor  # (B,), largest radius
+    spoilt: Spoilt | None = None  # by other spheres, see `Fitter.spoilt`; None: unknown
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Fitter:
-    """Fits poses to the pictures of all views; made by the pipeline once blur and light are known."""
+    """Fits poses to the pictures of all views, with known blur and light."""
 
     views: Sequence[CameraView]
     radius_mm: float
     optics: Optics
     light: Light
     device: torch.device = CPU  # of the fits; inputs and results are on the CPU
-    widest_px: float = 0.0  # radius of a disk as large as any that is expected; 0 where nothing is known
+    widest_px: float = 0.0  # largest expected radius of a disk; 0: unknown
     limb_px: Tensor | None = None  # (C,), see `SphereModel`; None: 0
-    most_hidden: float = MOST_HIDDEN  # share of a disk that occluders may cover; 0: the model is wrong, none are sought
-    instants: int = 1  # of the exposure that fits render; 1: the sphere as if at rest, the blur holds its motion
+    most_hidden: float = (
+        MOST_HIDDEN  # share of a disk that occluders may cover; 0: none are sought, as the model is wrong
+    )
+    instants: int = 1  # rendered in an exposure; 1: the sphere at rest, with motion blur as blur
     _models: dict[PyramidLevel, SphereModel] = field(default_factory=dict, init=False, repr=False)
 
     def model(self, level: PyramidLevel | None = None) -> SphereModel:
-        """Return what the pictures of a level depend on, by default of the finest."""
+        """Return the measuring model at a level, by default the finest."""
         level = level or self.optics.fine
         if level not in self._models:
-            first = not self.light.known and level.extra_px == 0  # high orders while nothing is learnt
+            first = not self.light.known and level.extra_px == 0  # high orders until the light is learnt
             self._models[level] = SphereModel(
                 radius_mm=self.radius_mm,
                 paint=level.paint,
@@ -76,19 +78,17 @@ class Fitter:
         return self._models[level]
 
     def with_blur(self, paint: TextureTable, blur_px: float, limb_blur_px: float | None = None) -> "Fitter":
-        """Return a fitter of paint whose pictures have a blur, px, and their limb another one; see `Optics`."""
+        """Return a fitter for paint and limb of other blurs, px; see `Optics`."""
         return replace(self, optics=Optics(paint, blur_px, widest_px(self.views), limb_blur_px))
 
     def with_light_of(self, pixels: Pixels, fit: FittedPoses, use: Tensor, *, glints: bool = True) -> "Fitter":
-        """Return a fitter with the light, of the same kind, and the noise of fitted pictures; see `Light.learnt`."""
+        """Return a fitter with light (of the same kind) and noise of fitted pictures; see `Light.learnt`."""
         return replace(self, light=self.light.learnt(pixels, fit, use, self.model(), glints=glints))
 
     def left(
         self, pixels: Pixels, fit: FittedPoses, use: Tensor, level: PyramidLevel | None = None, iterations: int = 3
     ) -> float:
-        """Return the mean of `logs_left` of poses fitted anew: the pictures of one camera may be left ten times as much
-        as of another.
-        """
+        """Return the mean of `logs_left` after a new fit: cameras' residuals may differ tenfold."""
         begin = PoseStart(fit.position_lab_mm, fit.R_lab_body, use)
         return float(logs_left(self.fit(pixels, begin, level or self.optics.fine, iterations), use).mean())
 
@@ -97,17 +97,17 @@ class Fitter:
         return replace(self, optics=self.optics.to(device), light=self.light.to(device), device=device)
 
     def of(self, *cameras: int) -> "Fitter":
-        """Return the fitter of some cameras by themselves."""
+        """Return the fitter of some of the cameras."""
         limb_px = self.limb_px if self.limb_px is None else self.limb_px[list(cameras)]
         return replace(self, views=[self.views[k] for k in cameras], light=self.light.of(*cameras), limb_px=limb_px)
 
     def disks_px(self, position_lab_mm: Tensor) -> DisksPx:
-        """Return where the disks lie that a sphere at (B, 3), mm, shows."""
+        """Return where the disks of a sphere at (B, 3), mm, lie."""
         middles, radii = body_of(position_lab_mm).disks(self.views, position_lab_mm, self.radius_mm)
         return DisksPx(middles, radii.nan_to_num().amax(0))
 
     def shows_unknown(self, camera: int, position_lab_mm: Tensor, R_lab_body: Tensor) -> Tensor:
-        """Return which poses (B, 3), mm, (B, 3, 3) turn hardly any known paint to a camera, (B,) bool."""
+        """Return at which poses (B, 3), mm, (B, 3, 3) a camera sees hardly any known paint, (B,) bool."""
         unseen, there = self.optics.fine.paint.unseen, self.views[camera].camera
         if unseen is None:
             return torch.zeros(len(R_lab_body), dtype=torch.bool)
@@ -116,7 +116,7 @@ class Fitter:
         return (unseen.sample(normal_body.float())[0] < UNSEEN).double().mean(-1) < KNOWN
 
     def stencil(self, level: PyramidLevel, radius_px: float) -> Stencil:
-        """Return the places of a disk of some radius, px, at a level."""
+        """Return the stencil of a disk of a given radius, px, at a level."""
         return level.stencil(min(radius_px, 0.5 * max(self.views[0].camera.image_size)))
 
     def places(
@@ -127,8 +127,8 @@ class Fitter:
         middle_px: Tensor,
         moved: Tensor | None = None,
     ) -> DiskPlaces:
-        """Return where the disks of B poses lie, for `spoilt`. `moved` (B, 6): turn (rad) and move (mm) while the
-        shutter is open; None: as if at rest.
+        """Return where the disks of B poses lie, for `spoilt`. `moved` (B, 6): rotation (rad) and displacement (mm)
+        during the exposure; None: at rest.
         """
         return DiskPlaces(
             sights=[view.sight for view in self.views],
@@ -143,7 +143,7 @@ class Fitter:
     def spoilt(
         self, position_lab_mm: Tensor, disks_px: DisksPx, moved: Tensor | None, neighbours: Neighbours
     ) -> Spoilt:
-        """Return where neighbours spoil the disks of B poses, for fits of `settled`; `moved` as of `places`."""
+        """Return where neighbours spoil the disks of B poses, for `settled`; `moved` as in `places`."""
         fine = self.optics.fine
         stencil = self.stencil(fine, self.widest_px)
         return spoilt(self.places(position_lab_mm, fine, stencil, disks_px.middle_px, moved), neighbours)
@@ -158,7 +158,7 @@ class Fitter:
         neighbours: Neighbours | None = None,
     ) -> Pixels:
         """Cut the disks of B poses out of the pictures of C views; position_lab_mm (B, 3) is right to a few pixels.
-        Without `radius_px` the largest disk sets it, so that the last bits depend on the batch. Places that
+        Without `radius_px` the largest disk sets the radius, so that the last bits depend on the batch. Places that
         `neighbours` spoil are not inside, see `spoilt`.
         """
         middle_px, largest_px, _ = self.disks_px(position_lab_mm)
@@ -171,7 +171,7 @@ class Fitter:
         return disks.pixels(level.extra_px)
 
     def unoccluded(self, pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor) -> Pixels:
-        """Return the pixels of B * C disks without those that something before the sphere shows; see `occluded`.
+        """Return the pixels of B * C disks without occluders; see `occluded`.
         Positions (B, 3), mm, and rotations (B, 3, 3) are right to a fraction of a pixel.
         """
         if self.most_hidden == 0.0:
@@ -189,7 +189,7 @@ class Fitter:
         return moved_to(CPU, fit)
 
     def again(self, pixels: Pixels, fit: FittedPoses, use: Tensor) -> FittedPoses:
-        """Refine fitted poses in all detail, once the model is another."""
+        """Refine fitted poses at full detail after a change of the model."""
         return self.fit(pixels, PoseStart(fit.position_lab_mm, fit.R_lab_body, use), self.optics.fine, 3)
 
     def fit_through(self, steps: Steps, pictures: Sequence[Sequence[Shown]], begin: PoseStart) -> FittedPoses:
@@ -203,9 +203,9 @@ class Fitter:
     def settled(
         self, frames: Sequence[Sequence[Shown]], begin: PoseStart, disks_px: DisksPx | None = None
     ) -> FittedPoses:
-        """Fit B poses that are right to a few degrees and pixels to the frames of C cameras, at the finest level: again
-        as long as steps are long. The position's precision counts where not all cameras see the sphere, and where it is
-        held. `disks_px`: what the method of this name tells of the first positions, where that is known.
+        """Fit B poses that are right to a few degrees and pixels to the frames of C cameras, at the finest level;
+        repeat while steps are long. The position's precision is used if not all cameras see the sphere, or if it is
+        held. `disks_px`: precomputed `self.disks_px` of the first positions; None: computed here.
         """
         if len(frames) == 1 and (alone := self._alone(frames[0], begin)) is not None:
             return alone
@@ -220,7 +220,7 @@ class Fitter:
         return fit
 
     def _alone(self, frames: Sequence[Shown], begin: PoseStart) -> FittedPoses | None:
-        """Fit one pose by one compiled call; None where that cannot be."""
+        """Fit one pose by one compiled call; None if that is impossible."""
         plain = all(isinstance(one, np.ndarray) and view.plain for one, view in zip(frames, self.views, strict=True))
         if not plain or begin.among is not None or self.device != CPU or body_of(begin.position_lab_mm) is IN_TORCH:
             return None
@@ -236,7 +236,7 @@ class Fitter:
         *,
         first: bool = True,
     ) -> FittedPoses:
-        """Fit once: first to some pixels; where that moves a pose far, disks are cut out anew."""
+        """Fit once: first with some pixels; disks of poses that moved far are cut out anew."""
         disks_px = disks_px or self.disks_px(begin.position_lab_mm)
         stencil, hidden = self.stencil(self.optics.fine, self.widest_px), None
         if begin.among is not None:
@@ -253,12 +253,12 @@ class Fitter:
 
 
 def logs_left(fit: FittedPoses, use: Tensor) -> Tensor:
-    """Return the logarithm of what fitted poses leave in each picture of `use`, (n,), see `scores_of`."""
+    """Return the logarithm of the unexplained share of each picture in `use`, (n,), see `scores_of`."""
     return (1.0 - fit.score)[use].clamp_min(LEAST_LEFT).log()
 
 
 def first_fitter(views: Sequence[CameraView], radius_mm: float, base: TextureTable, blur_px: float) -> Fitter:
-    """Return a fitter with an assumed blur, and flat light with the scenes' noise and a little sensor noise."""
+    """Return a fitter with an assumed blur, flat light, and the scenes' noise with a little sensor noise."""
     noise = torch.tensor([[view.background.typical_noise**2, 0.02, 0.001, 0.0] for view in views])
     light = DiskLight.unknown(len(views), noise)
     return Fitter(views=views, radius_mm=radius_mm, optics=Optics(base, blur_px, widest_px(views)), light=light)

@@ -1,7 +1,7 @@
 """A converged fit of poses with its derivatives, by the implicit function theorem (docs/differentiable.md).
 At the minimum of sum r(pose, theta)^2 / 2 the gradient g is 0, so that d pose / d theta = -H^-1 dg/dtheta with H =
 dg/dpose. `implicit_pose` fits without a graph and then takes one Newton step -H^-1 g with H constant. The fit of
-`track` cannot serve: it holds weights, light and slopes fixed, in single precision.
+`track` does not serve: it keeps weights, light and slopes fixed, in single precision.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ _Residual = Callable[[Tensor, Tensor], Tensor]  # R_lab_body (B, 3, 3), position
 
 START_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e9  # of Levenberg and Marquardt, relative to the diagonal
 EASE, STIFFEN = 0.2, 5.0  # factors after a good and after a bad step
-FLAT = 1e-6  # 1/rad^2 and 1/mm^2: below, a direction (sigma 1000 rad or 1 m) is not determined
+FLAT = 1e-6  # 1/rad^2 and 1/mm^2: a direction with less (sigma above 1000 rad or 1 m) is undetermined
 ARRIVED_RAD, ARRIVED_MM = 1e-3, 1e-2  # largest Newton step of a converged fit
 
 
@@ -28,7 +28,7 @@ class ImplicitPose:
     R_lab_body: Tensor  # (B, 3, 3), NaN in frames not used
     position_lab_mm: Tensor  # (B, 3), NaN in frames not used
     cost: Tensor  # (B,), half the sum of squared residuals at these poses, differentiable too; 0 in frames not used
-    arrived: Tensor  # (B,) bool, converged fits; the others stay where they ended, with gradient 0
+    arrived: Tensor  # (B,) bool, converged; other poses are where the fit ended, with gradient 0
 
 
 def implicit_pose(
@@ -86,21 +86,21 @@ def implicit_pose(
 
 
 def _newton_step(residuals: Callable[[Tensor], Tensor], still: Tensor) -> Tensor:
-    """Return the step (B, 6) from no change, `still`, to the minimum; differentiable, with a constant Hessian."""
+    """Return the Newton step (B, 6) from `still`, no change, to the minimum; the Hessian has no gradient."""
     slope = torch.func.grad(lambda delta: 0.5 * residuals(delta).square().sum())
     gradient = slope(still)
     with torch.no_grad():  # the Hessian (B, 6, 6): J^T J is biased
         columns = torch.func.vmap(lambda axis: torch.func.jvp(slope, (still,), (axis,))[1])(_axes(still))
         curvature = columns.movedim(0, -1)
         rounding = 10 * torch.finfo(curvature.dtype).eps
-        # Undetermined directions become 0.
+        # Undetermined directions get no step.
         inverse = torch.linalg.pinv(0.5 * (curvature + curvature.mT), atol=FLAT, rtol=rounding, hermitian=True)
     step: Tensor = -(inverse @ gradient[..., None])[..., 0]
     return step
 
 
 def _levenberg_marquardt(residual: _Residual, R: Tensor, X: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
-    """Return the poses (B, 3, 3), (B, 3) with the least sum of squares (Marquardt 1963); no step makes one worse."""
+    """Return the poses (B, 3, 3), (B, 3) with the least sum of squares (Marquardt 1963); no step increases it."""
     damping = torch.full_like(X[:, 0], START_DAMPING)
     still = torch.zeros_like(X).repeat(1, 2)
     for _ in range(iterations):
@@ -110,7 +110,7 @@ def _levenberg_marquardt(residual: _Residual, R: Tensor, X: Tensor, iterations: 
         floor = damping[:, None] * diagonal + FLAT  # a flat direction gets no step
         step: Tensor = torch.linalg.solve_ex(normal + torch.diag_embed(floor), -pull[..., None]).result[..., 0]
         R_next, X_next = moved_by(R, X, step)
-        # Near the minimum sums of squares differ by rounding only.
+        # Near the minimum, sums of squares differ only by rounding.
         slack = 1.0 + 8.0 * torch.finfo(X.dtype).eps
         better = residual(R_next, X_next).square().sum(-1) <= r.square().sum(-1) * slack
         R, X = torch.where(better[:, None, None], R_next, R), torch.where(better[:, None], X_next, X)
@@ -119,7 +119,7 @@ def _levenberg_marquardt(residual: _Residual, R: Tensor, X: Tensor, iterations: 
 
 
 def moved_by(R_lab_body: Tensor, position_lab_mm: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
-    """Apply small errors (B, 6), rad and mm, lab, from the left, to poses; Cayley's rotation is smooth at 0."""
+    """Apply errors (B, 6), rad and mm, lab, to poses from the left; Cayley's rotation is smooth at 0."""
     half = so3.hat(0.5 * delta[..., :3])
     scale = 2.0 / (1.0 + 0.25 * delta[..., :3].square().sum(-1))
     turned = R_lab_body + scale[..., None, None] * ((half + half @ half) @ R_lab_body)

@@ -1,5 +1,5 @@
-"""Errors that last over frames: what light and map leave in the same place of every picture.
-The fit's covariance holds what differs from frame to frame. A path through all frames averages that away; these stay.
+"""Errors that last over frames: errors by light and map in the same part of every picture.
+The fit's covariance describes errors that differ from frame to frame. A path averages those, but not these.
 """
 
 from dataclasses import dataclass, replace
@@ -15,33 +15,33 @@ from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.so3 import inverse_damped, solve_damped
 
-TILES = 4  # along each axis of the disk: errors of light are wide
-DARKEST = 0.5  # grey levels; darker places tell no power of their light
-LIMB_PX = 0.04  # standard deviation of the limb's place over 23 movies of one camera (scripts/stated_errors.py)
-WHOLE = 0.98  # coverage of a pixel that the limb does not cut: the limb has tiles of its own
+TILES = 4  # along each axis of the disk: errors of light extend far
+DARKEST = 0.5  # grey levels; darker places do not determine the power of the light
+LIMB_PX = 0.04  # standard deviation of the limb's position over 23 movies of one camera (scripts/stated_errors.py)
+WHOLE = 0.98  # least coverage of a pixel inside the limb; the limb has its own tiles
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lasting:
-    """Covariances of the errors that all frames of a movie share; made by `lasting_errors`."""
+    """Covariances of the errors that all frames of a movie share."""
 
-    covariance: Tensor  # (6, 6), of delta (rad, lab) and position (mm) by all cameras together
-    own_rad2: Tensor  # (C, 3, 3), of the rotation by each camera alone, position held
-    alone: Tensor  # (C, 6, 6), as `covariance`, by each camera alone
+    covariance: Tensor  # (6, 6), of delta (rad, lab) and position (mm), all cameras together
+    own_rad2: Tensor  # (C, 3, 3), of the rotation, each camera alone, position held
+    alone: Tensor  # (C, 6, 6), as `covariance`, each camera alone
 
     @classmethod
     def none(cls, cameras: int) -> "Lasting":
-        """Return no such errors."""
+        """Return zero errors."""
         zeros = torch.zeros(cameras, 6, 6, dtype=torch.float64)
         return cls(covariance=zeros[0], own_rad2=zeros[:, :3, :3], alone=zeros)
 
     def of(self, *cameras: int) -> "Lasting":
-        """Return those of some cameras."""
+        """Return the errors of some of the cameras."""
         own, alone = self.own_rad2[list(cameras)], self.alone[list(cameras)]
         return Lasting(covariance=alone[0] if len(cameras) == 1 else self.covariance, own_rad2=own, alone=alone)
 
     def with_place(self, covariance: Tensor) -> "Lasting":
-        """Add what the error (6, 6) of a place at which all poses are held does to them."""
+        """Add the error (6, 6) of the held position of all poses."""
         return replace(self, covariance=self.covariance + covariance, alone=self.alone + covariance)
 
     def of_use(self, use: Tensor) -> Tensor:
@@ -49,7 +49,7 @@ class Lasting:
         return self.alone[use][0] if int(use.sum()) == 1 else self.covariance
 
     def widened(self, one: FittedPoses, other: FittedPoses, use: Tensor) -> "Lasting":
-        """Return errors that hold the mean difference of B poses by two models, `use` (B, C), that explain as much."""
+        """Return errors that include the mean difference of B poses between two equally good models, `use` (B, C)."""
         turn = so3.log(other.R_lab_body @ one.R_lab_body.mT)
         way = torch.cat([turn, other.position_lab_mm - one.position_lab_mm], dim=1)
         seen = use.to(turn.dtype)[..., None]
@@ -65,11 +65,11 @@ class Lasting:
 def lasting_errors(
     pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, wider: SphereModel | None = None
 ) -> Lasting:
-    """Estimate the errors that B poses share from the fits of B * C disks, those of `use` (B, C) bool.
-    One turn and move of all poses, with the light of each camera, its glints, the place and width of its limb and, with
-    a model of `wider` blur, that of the paint and its response, are fitted to all frames but for one tile of one
-    camera's disk: by how much that changes them from tile to tile. What is wrong in a place of every picture shows, and
-    what light, glints or limb could take of it; of few frames their noise as well.
+    """Estimate the errors that B poses share from the fits of B * C disks, those in `use` (B, C) bool.
+    One common rotation and displacement is fitted to all frames, leaving out one tile of one camera's disk at a time;
+    its scatter from tile to tile is the error. Also fitted are each camera's light and glints, its limb's position and
+    width and, with a model of `wider` blur, the paint's blur and the response. The error holds what is wrong in the
+    same part of every picture and what light, glints or limb can absorb; with few frames also their noise.
     Source: the jackknife over clusters, CR3 of Bell and McCaffrey 2002.
     """
     normal, right, ridge = _by_tile(pixels, fit, use, model, wider)
@@ -82,7 +82,7 @@ def lasting_errors(
 
     together = of_left_out(*_joined(normal, right, ridge))[:6, :6]
     own = by_each([0, 1, 2, *range(6, 6 + others)], 3)
-    # One camera does not tell the place of its limb from the distance: what is known of it is its spread over movies.
+    # One camera cannot separate its limb's position from the distance: the scatter over movies is used.
     free = [k for k in range(6 + others) if k != limb]
     alone = by_each(free, 6)
     whole = normal.sum(1) + ridge
@@ -91,8 +91,8 @@ def lasting_errors(
 
 
 def limb_wider_px(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel) -> float:
-    """Return by how much the limb of B * C disks, those of `use` (B, C), is blurred more than in the model, px.
-    One turn and move of all poses, with the light of each camera and the place of its limb, may change with it.
+    """Return the extra blur, px, of the limb of B * C disks, those in `use` (B, C), over the model's.
+    A common rotation and displacement, each camera's light and its limb's position are fitted with it.
     """
     normal, right, ridge = _by_tile(pixels, fit, use, model)
     joined, pulled, ridges = _joined(normal, right, ridge)
@@ -106,8 +106,8 @@ def limb_wider_px(pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereMo
 def response_exponents(
     pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, wider: SphereModel
 ) -> tuple[Tensor, Tensor]:
-    """Return the logarithm of the power of their light by which the pictures of each camera fit best, (C,), and its
-    standard deviation by the jackknife of `lasting_errors`. What else may change, and `wider`: as there.
+    """Return the logarithm of the power of the light that fits each camera's pictures best, (C,), and its standard
+    deviation by the jackknife of `lasting_errors`. The other unknowns, and `wider`: as there.
     """
     joined, pulled, ridge = _joined(*_by_tile(pixels, fit, use, model, wider))
     last = torch.arange(1, use.shape[1] + 1) * ((ridge.shape[-1] - 6) // use.shape[1]) + 5
@@ -124,8 +124,8 @@ def _px_mm(pixels: Pixels, fit: FittedPoses) -> Tensor:
 
 
 def _joined(normal: Tensor, right: Tensor, ridge: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the normal equations of all cameras, (C * T, n, n), (C * T, n), (n, n), from those of each: they share the
-    pose; each has a light and a limb of its own.
+    """Return the normal equations of all cameras, (C * T, n, n), (C * T, n), (n, n), from those of each camera: the
+    pose is common; light and limb are each camera's own.
     """
     cameras, others = len(normal), normal.shape[-1] - 6
     place = torch.zeros(cameras, 6 + cameras * others, 6 + others, dtype=torch.float64)
@@ -138,7 +138,7 @@ def _joined(normal: Tensor, right: Tensor, ridge: Tensor) -> tuple[Tensor, Tenso
 
 
 def _holding(covariance: Tensor, difference: Tensor) -> Tensor:
-    """Widen covariances (..., n, n) until differences (..., n) are one standard deviation; those that are less stay."""
+    """Widen covariances (..., n, n) until differences (..., n) are at most one standard deviation."""
     size = (difference * solve_damped(covariance, difference)).sum(-1)[..., None, None]
     return covariance + (1 - 1 / size.clamp_min(1)) * difference[..., :, None] * difference[..., None, :]
 
@@ -146,10 +146,10 @@ def _holding(covariance: Tensor, difference: Tensor) -> Tensor:
 def _by_tile(
     pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, wider: SphereModel | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return normal equations of pose, light and limb of each tile, (C, T, n, n) and (C, T, n), and a ridge of all but
-    the pose, (C, n, n), float64: summed over frames, each with its own coefficients of light eliminated, and the glints
-    that all share. The limb has tiles of its own; the last two unknowns are its place and width, px; with a model of
-    `wider` blur there follow the share of that and the logarithm of the power of the light.
+    """Return normal equations of pose, light and limb for each tile, (C, T, n, n) and (C, T, n), and a ridge of all
+    unknowns but the pose, (C, n, n), float64. They are sums over frames, each frame's own light and the common glints
+    eliminated. The limb has its own tiles. The last two unknowns are its position and width, px; with a model of
+    `wider` blur the share of that blur and the logarithm of the power of the light follow.
     """
     cameras, at = use.shape[1], fitted_residuals(pixels, fit, model)
     precision = at.weight / at.variance * use.reshape(-1, 1)
@@ -158,7 +158,7 @@ def _by_tile(
     of_camera = [limb, width]
     if wider is not None:
         of_camera.append(fitted_residuals(pixels, fit, wider).model - at.model)
-        scale = at.model.mean()  # that of the light is free
+        scale = at.model.mean()  # the scale of the light is free
         of_camera.append((1.0 - at.view.coverage) * by_power(at.beside, scale) - by_power(at.model, scale))
     columns = torch.cat([at.design[:, :6], light_columns(at.view), torch.stack(of_camera, dim=1)], dim=1)
     weighted = at.design[:, 6:] * precision[:, None]
@@ -189,8 +189,8 @@ def _by_tile(
 
 
 def cell_means(values: Tensor, weight: Tensor, cell: Tensor, shares: Tensor) -> Tensor:
-    """Return what to take off values (B, P, n) so that their sums of products are those with a coefficient for each
-    cell eliminated, (B, P, n); weight and cell (B, P), shares (cells,) as `glint_shares`.
+    """Return what to subtract from values (B, P, n) so that a coefficient of each cell is eliminated from their sums of
+    products, (B, P, n); weight and cell (B, P), shares (cells,) as `glint_shares`.
     Source: random effects by partial demeaning, Fuller and Battese 1974.
     """
     flat, of = values.flatten(0, 1), cell.flatten()
@@ -201,13 +201,13 @@ def cell_means(values: Tensor, weight: Tensor, cell: Tensor, shares: Tensor) -> 
 
 
 def by_power(light: Tensor, scale: Tensor) -> Tensor:
-    """Return the derivative of light, grey levels, by the logarithm of a power of it that leaves `scale` as it is."""
+    """Return the derivative of light, grey levels, by the logarithm of its power; `scale` is a fixed point."""
     some = light.clamp_min(DARKEST)
     return some * (some / scale).log()
 
 
 def of_left_out(normal: Tensor, right: Tensor, ridge: Tensor) -> Tensor:
-    """Return the covariance (n, n) of a solution by what leaving out each of T parts changes.
+    """Return the jackknife covariance (n, n) of a solution when each of T parts is left out.
     Normal equations (T, n, n), (T, n) of the parts, and a ridge (n, n) of all.
     """
     determined = normal.diagonal(dim1=-2, dim2=-1).any(-1)

@@ -1,4 +1,4 @@
-"""The measuring model: what a picture of the painted sphere depends on, its light, and what pixels then show."""
+"""The measuring model: what a picture of the painted sphere depends on, and its light."""
 
 import math
 from abc import ABC, abstractmethod
@@ -15,18 +15,18 @@ from sphereorient.so3 import solve_damped
 from sphereorient.sphere.texture_table import TextureTable
 from sphereorient.sphere.view import polynomials
 
-UNSEEN = 0.02  # a pixel that looks at a larger share of unknown paint counts for nothing
+UNSEEN = 0.02  # a pixel with a larger share of unknown paint is not used
 STRAY_ORDER = 4  # of the harmonics over the angle about the disk
 LEAN_ORDER = 3  # of the polynomials of the light's slope
-EVERY = 4  # n-th place suffices for numbers of a whole disk: they are in order of distance from its middle
-SHADOW, BRIGHT = 0.05, 0.9  # share of the bright light, a quantile over the disk, below which the limb is in shadow
-IN_SIGHT = 0.99  # coverage of a pixel that the limb does not cut
-DARKEST = 0.05  # of the brightest light of white paint: the logarithm of less has no use
+EVERY = 4  # n-th place is used for statistics of a disk: they are in order of distance from its middle
+SHADOW, BRIGHT = 0.05, 0.9  # share of the bright light below which the limb is in shadow; its quantile over the disk
+IN_SIGHT = 0.99  # least coverage of a pixel inside the limb
+DARKEST = 0.05  # of the brightest light of white paint: lower limit before the logarithm
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shading:
-    """Orders of the polynomials by which a frame's light may differ from the learnt one."""
+    """Orders of the polynomials by which a frame's light may differ from the learnt light."""
 
     difference: int
     black: int
@@ -44,7 +44,7 @@ LATER = Shading(difference=2, black=1)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SphereView:
-    """The sphere in the pixels of L disks at one pose each; made by `sphere_view`."""
+    """The sphere in the pixels of L disks at one pose each."""
 
     paint: Tensor  # (L, P), blurred paint seen, 0 .. 1
     coverage: Tensor  # (L, P), share of the pixel's blurred aperture that the sphere fills
@@ -54,15 +54,15 @@ class SphereView:
     paint_by_rotation: Tensor  # (L, 3, P), derivative by delta in exp([delta]x) R, 1/rad
     paint_by_position: Tensor  # (L, 3, P), derivative by the centre, lab, 1/mm
     coverage_by_position: Tensor  # (L, 3, P), 1/mm
-    known: Tensor | None  # (L, P) bool, whether all paint that the pixel looks at is known; None: everywhere
+    known: Tensor | None  # (L, P) bool, whether all paint of the pixel is known; None: everywhere
     blur: Tensor  # (L, 1), standard deviation of the aperture, radii
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LightTables:
-    """What compiled code looks up instead of `Light.at`."""
+    """Tables that compiled code reads instead of `Light.at`."""
 
-    kind: int  # of the light, as `shine` in refine.c numbers them
+    kind: int  # of light, as numbered in `shine` of refine.c
     cells: Tensor  # (n, k) float32, grey levels
     side: int  # cells along each axis of a map
     cover: Tensor | None = None  # (depths, 2), of light in the lab
@@ -73,24 +73,24 @@ class LightTables:
 class Light(ABC):
     """Light and noise of the pictures of C cameras: a pixel of the sphere shows paint * difference + black.
     The noise of grey level I has the variance noise[0] + noise[1] I + noise[2] I^2 + noise[3] I^3 (read-out; photons;
-    grain of all paint, of white paint alone). Stray light of a lens with glare, or of a wall that the sphere lights, is
-    a sum of `stray_basis` beside the sphere.
+    grain of all paint; grain of white paint). Stray light (a lens with glare, a wall that the sphere lights) is a sum
+    of `stray_basis` beside the sphere.
     """
 
     difference: Tensor  # coefficients of white less black paint, grey levels
     black: Tensor  # coefficients of black paint
     noise: Tensor  # (C, 4), grey levels^2 .. 1 / grey level
-    stray: Tensor  # (C, K), grey levels that the empty scene lacks
+    stray: Tensor  # (C, K), grey levels added to the empty scene
     lean: Tensor  # (C, 2, K), slope of the logarithm of `difference` across the disk, 1/radii: see `leaning`
-    dark: Tensor  # (C,), `difference`, grey levels, below which a place on the limb does not count
-    known: bool = True  # whether it is estimated from pictures
+    dark: Tensor  # (C,), `difference`, grey levels: darker places on the limb are not used
+    known: bool = True  # whether estimated from pictures
 
     of_cameras: ClassVar[tuple[str, ...]]  # parts with an entry for each camera
-    linear: ClassVar[bool]  # whether one estimate at given poses is final; another light gets better by repetition
+    linear: ClassVar[bool]  # whether one estimate at given poses is final; otherwise repetition improves it
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
-        """Return the names of the tensors that the light consists of."""
+        """Return the names of the light's tensors."""
         return tuple(field.name for field in fields(cls) if field.name != "known")
 
     def parts(self) -> dict[str, Tensor]:
@@ -98,11 +98,11 @@ class Light(ABC):
         return {name: getattr(self, name).cpu() for name in self.names()}
 
     def of(self, *cameras: int) -> Self:
-        """Return the light of some cameras."""
+        """Return the light of some of the cameras."""
         return replace(self, **{name: getattr(self, name)[list(cameras)] for name in self.of_cameras})
 
     def with_lean(self, view: SphereView, pixels: Pixels, use: Tensor) -> Self:
-        """Return the light with its slopes and shadows as B * C disks, those of `use` (B, C) bool, show them."""
+        """Return the light with slopes and shadows estimated from B * C disks, those in `use` (B, C) bool."""
         cameras, some = use.shape[1], slice(None, None, EVERY)
         parts = (self.at(view, pixels)[0], view.coverage, view.across)
         difference, coverage, across = (part[..., some].double().nan_to_num() for part in parts)
@@ -129,33 +129,33 @@ class Light(ABC):
 
     @abstractmethod
     def mirrors(self, view: SphereView, pixels: Pixels) -> Tensor:
-        """Return what of the pixels of L disks the surface mirrors, whatever the paint, grey levels (L, P)."""
+        """Return the light that the surface mirrors in L disks, whatever the paint, grey levels (L, P)."""
 
     @property
     @abstractmethod
     def tables(self) -> LightTables:
-        """What `at` looks up."""
+        """Tables that `at` reads."""
 
     @abstractmethod
     def learnt(
         self, pixels: Pixels, fit: FittedPoses, use: Tensor, model: "SphereModel", *, glints: bool = True
     ) -> Self:
-        """Estimate light and noise anew from the fits of B * C disks, those of `use` (B, C) bool. `model` has this
-        light; without `glints` maps of the disk have none.
+        """Estimate light and noise anew from the fits of B * C disks, those in `use` (B, C) bool. `model` has this
+        light; without `glints`, maps of the disk have none.
         """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SphereModel:
-    """What a picture of the sphere depends on, its pose aside."""
+    """What a picture of the sphere depends on, except its pose."""
 
     radius_mm: float
-    paint: TextureTable  # blurred as seen at the disk's middle
-    blur_px: float  # of the limb: standard deviation of optics, pixel and whatever was laid over the frame, px
+    paint: TextureTable  # with the blur at the disk's middle
+    blur_px: float  # of the limb: standard deviation by optics, pixel and added blur, px
     light: Light  # of the C cameras
-    shading: Shading = LATER  # how far a frame's light may differ from it
-    limb_px: Tensor | None = None  # (C,), how far the limb lies outside of its place by all cameras: an error; None: 0
-    near_rad: float = math.inf  # a step that is longer wants another one: beyond the blur grey levels are not linear
+    shading: Shading = LATER  # how far a frame's light may differ from `light`
+    limb_px: Tensor | None = None  # (C,), error of the limb: outwards from its position by all cameras; None: 0
+    near_rad: float = math.inf  # another step follows a longer one: grey levels are linear only within the blur
 
 
 def surface_normals(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor]:
@@ -183,8 +183,8 @@ def _slopes() -> tuple[Tensor, Tensor]:
 
 
 def leaning(view: SphereView, pixels: Pixels, model: SphereModel) -> SphereView:
-    """Return the view of L disks with its paint where light is brighter on one side. A blur of light times paint is the
-    product of both blurred, the paint looked up nearer to the light by blur^2 times the slope of its logarithm.
+    """Return the view of L disks with paint corrected for light brighter on one side. The blur of light times paint is
+    the product of both blurred, with the paint shifted towards the light by blur^2 times the slope of its logarithm.
     """
     lean = model.light.lean.to(view.paint)
     if not bool(lean.any()):
@@ -214,8 +214,8 @@ def even_light(cameras: int) -> dict[str, Tensor]:
 
 
 def scene_beside(view: SphereView, pixels: Pixels, stray: Tensor) -> Tensor:
-    """Return what L disks show beside the sphere, grey levels (L, P): the empty scene, and stray light (C, K) of the
-    C cameras, which only pixels that the limb may reach are asked for.
+    """Return what L disks show beside the sphere, grey levels (L, P): the empty scene, and stray light (C, K) of the C
+    cameras, computed only near the limb.
     """
     if not bool(stray.any()):
         return pixels.behind

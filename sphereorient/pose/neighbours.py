@@ -1,4 +1,4 @@
-"""Other spheres beside the one that is fitted: where they cover its pixels, and which part of its disk is left."""
+"""Other spheres beside the fitted one: which pixels they cover, and which part of its disk is left."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sphereorient.pose.pixels import LinesOfSight, Stencil
 
-# Standard deviations of the blur: beyond a limb by this much a sphere covers .004 of a pixel, within it all but .004.
+# Standard deviations of the blur: this far outside a limb a sphere covers .004 of a pixel, as far inside all but .004.
 CLEAR = 2.65
 
 Floats = NDArray[np.float64]
@@ -23,16 +23,16 @@ class Neighbours:
 
     position_lab_mm: Tensor  # (B, K, 3) float64; NaN: none there
     radius_mm: Tensor  # (B, K)
-    move_mm: Tensor  # (B, K, 3), while the shutter is open
+    move_mm: Tensor  # (B, K, 3), during the exposure
 
     def of(self, rows: Tensor | Sequence[int]) -> "Neighbours":
-        """Return those of some poses, by index."""
+        """Return the neighbours of some poses, by index."""
         parts: dict[str, Any] = {name: part[rows] for name, part in vars(self).items()}
         return Neighbours(**parts)
 
 
 def joined_neighbours(each: Sequence[Neighbours | None]) -> Neighbours | None:
-    """Return the neighbours of all poses; None where none has any."""
+    """Return the neighbours of all poses; None if there are none."""
     known = [one for one in each if one is not None]
     if not known:
         return None
@@ -42,7 +42,7 @@ def joined_neighbours(each: Sequence[Neighbours | None]) -> Neighbours | None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DiskPlaces:
-    """Where the disks of B poses lie before C cameras; made by `Fitter`."""
+    """Where the disks of B poses lie in C cameras."""
 
     sights: Sequence[LinesOfSight]  # C
     stencil: Stencil
@@ -50,16 +50,16 @@ class DiskPlaces:
     position_lab_mm: Tensor  # (B, 3)
     radius_mm: float
     blur_px: float  # standard deviation of the pictures' blur
-    move_mm: Tensor | None = None  # (B, 3), while the shutter is open; None: all spheres are as if at rest
+    move_mm: Tensor | None = None  # (B, 3), during the exposure; None: all spheres at rest
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Spoilt:
-    """Where other spheres spoil the disks of B poses before C cameras. A nearer one covers the disk; one behind shows
+    """Where other spheres spoil the disks of B poses in C cameras. A nearer one covers the disk; one behind appears
     beside the limb, where the model expects the empty scene.
     """
 
-    hidden: Tensor | None  # (B * C, P) bool, places that do not count; None: all count
+    hidden: Tensor | None  # (B * C, P) bool, places not used; None: all are used
     left: Tensor  # (B, C) float64, the share of each disk that no other sphere covers
 
 
@@ -81,18 +81,18 @@ def spoilt(disks: DiskPlaces, neighbours: Neighbours) -> Spoilt:
 
 
 def _spoilt_before(disks: DiskPlaces, neighbours: Neighbours, camera: int) -> tuple[NDArray[Any], ...] | None:
-    """Return the n poses whose disks others are near before a camera, by index, which places of these are spoilt, and
-    which are their own, (n, P) bool; None without any.
+    """Return the indices of the n poses with neighbours near their disks in a camera, the spoilt places of these disks
+    and their own places, (n, P) bool; None if there are none.
     """
     sight, middle_px = disks.sights[camera], disks.middle_px[camera].nan_to_num().numpy()
-    # The sphere itself is the first of all.
+    # The sphere itself comes first.
     X = torch.cat([disks.position_lab_mm[:, None], neighbours.position_lab_mm], dim=1).numpy()
     radius_mm = np.insert(neighbours.radius_mm.numpy(), 0, disks.radius_mm, axis=1)
     direction, origin, pitch_rad, pitch_mm = (part[:, None] for part in sight.about(middle_px))
     along = ((X - origin) * direction).sum(-1)
     aside = np.linalg.norm(X - origin - along[..., None] * direction, axis=-1)
     pitch = pitch_rad * along.clip(0.0) + pitch_mm
-    # Another sphere's middle lies within its own radius and that of the stencil of this one's line of sight.
+    # Near: the centre is less than its own and the stencil's radius from this sphere's line of sight.
     near = aside < radius_mm + (disks.stencil.reach + 1) * pitch
     rows = np.flatnonzero(near[:, 1:].any(1))
     if not len(rows):
@@ -106,20 +106,20 @@ def _spoilt_before(disks: DiskPlaces, neighbours: Neighbours, camera: int) -> tu
     blur = disks.blur_px * pitch[of, which] / radius_mm[of, which]
 
     def limit_mm2(edge: float) -> Floats:
-        # Half of a blur on the limb of a disk lies within blur^2 / 2 less than within a straight edge.
+        # The limb is curved: a blur is half covered blur^2 / 2 radii inside it.
         limit: Floats = (radius_mm[of, which] * (1.0 - 0.5 * blur**2 - edge * blur).clip(0.0))[:, None] ** 2
         return limit
 
     own = which == 0
     beside = (most > limit_mm2(CLEAR))[own]
-    # A nearer one covers places; one behind shows where the sphere does not cover it.
+    # A nearer sphere covers places; one behind is visible beside this one.
     spoilt_ = (least < limit_mm2(-CLEAR)) & (beside[at] | (along[of, which] < along[of, 0])[:, None])
     spoilt_[own] = False
     return rows, np.maximum.reduceat(spoilt_, np.flatnonzero(own)), (least < limit_mm2(0.0))[own]
 
 
 def _ends(disks: DiskPlaces, neighbours: Neighbours, X: Floats) -> list[Floats]:
-    """Return positions (B, 1 + K, 3) as the shutter opens and as it closes; as they are where all are at rest."""
+    """Return positions (B, 1 + K, 3) at the start and at the end of the exposure; one entry if all are at rest."""
     if disks.move_mm is None:
         return [X]
     move = torch.cat([disks.move_mm[:, None], neighbours.move_mm], dim=1).numpy()
@@ -127,7 +127,7 @@ def _ends(disks: DiskPlaces, neighbours: Neighbours, X: Floats) -> list[Floats]:
 
 
 def _away_mm2(lines: Sequence[NDArray[np.float32]], X: Floats) -> Floats:
-    """Return how far from points (n, 3) lines of sight (n, 3, P) pass, squared, (n, P)."""
+    """Return the squared distances (n, P) of points (n, 3) from lines of sight (n, 3, P)."""
     direction, origin = lines
     to_point = X[:, :, None] - origin
     along = np.einsum("ncp,ncp->np", to_point, direction)

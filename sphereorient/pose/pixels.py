@@ -16,15 +16,15 @@ from sphereorient.cameras import Camera, R_cam_view, in_air
 from sphereorient.cameras.fisheye import FisheyeCamera
 from sphereorient.locate import Background
 
-VECTOR = 32  # numbers that one step of a loop over a tensor takes, at most
-# Parts of `Pixels`, the places along their last axis.
+VECTOR = 32  # most numbers that a vectorised loop takes in one step
+# Parts of `Pixels` whose last axis is the places.
 ALONG_PLACES = ("grey", "behind", "inside", "clipped", "direction")
-OF_DISKS = (*ALONG_PLACES, "origin", "axes", "pitch_rad", "pitch_mm", "moved")  # and those with an entry for each disk
-# Side of a tile: least, in standard deviations of the blur (3 px: errors over sigma are 1.0 with 14 px, 1.4 with 6),
-# and how many there are at least across half a disk.
+OF_DISKS = (*ALONG_PLACES, "origin", "axes", "pitch_rad", "pitch_mm", "moved")  # and parts with an entry per disk
+# Side of a tile: least, px; in standard deviations of the blur (for 3 px, errors over sigma are 1.0 with 14 px, 1.4
+# with 6); least number across half a disk.
 TILE_PX, TILE_BLURS, FEWEST_TILES = 6, 10.0, 3
-BACKWARD = -0.17  # cosine to the axis of lines of sight that are used: beyond, a disk is twice as wide as high
-INNER = 0.67  # of a stencil's radius: within it the limb is far, also of a disk that is smaller than the stencil
+BACKWARD = -0.17  # least cosine of a line of sight to the axis: beyond it a disk is twice as wide as high
+INNER = 0.67  # of a stencil's radius: nearer places are well inside the limb, also of a smaller disk
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,18 +35,18 @@ class Pixels:
 
     grey: Tensor  # (L, P), grey levels
     behind: Tensor  # (L, P), grey levels of the scene without the sphere
-    inside: Tensor  # (L, P) bool, places that lie in the picture and are not masked
-    clipped: Tensor  # (L, P) bool, saturated: the true grey level is this one or a higher one
+    inside: Tensor  # (L, P) bool, in the picture and not masked
+    clipped: Tensor  # (L, P) bool, saturated: the true grey level is this or higher
     direction: Tensor  # (L, 3, P), unit lines of sight, lab
     origin: Tensor  # (L, 3, 1) or (L, 3, P), where they start, lab, mm
     axes: Tensor  # (L, 2, 3), the camera's x and y in the lab
     pitch_rad: Tensor  # (L,), angle between neighbouring lines of sight at the disk's middle
-    pitch_mm: Tensor  # (L,), how far apart they start; 0 but behind a wall and in parallel light
-    moved: Tensor  # (L, 6) float64, turn (rad) and move (mm, lab) of the sphere while the shutter is open
-    tile: Tensor  # (P,) int64, square tile of the disk that a place belongs to, for errors that neighbours share
+    pitch_mm: Tensor  # (L,), distance of their origins; not 0 behind a port and in parallel projection
+    moved: Tensor  # (L, 6) float64, rotation (rad) and displacement (mm), lab, during the exposure
+    tile: Tensor  # (P,) int64, square tile of the disk, for correlated errors
     place: Tensor  # (2, P) int64, px to the right of and below the middle pixel
     inner: int = 0  # number of first places well within the limb
-    instants: int = 1  # of the exposure that are rendered; 1: the sphere as if at rest
+    instants: int = 1  # rendered in an exposure; 1: the sphere at rest
 
     def __len__(self) -> int:
         """Return the number of disks."""
@@ -66,7 +66,7 @@ class Pixels:
         return replace(some, inner=min(len(range(0, self.inner, step)), some.grey.shape[1]))
 
     def exposed(self, moved: Tensor | None, instants: int) -> "Pixels":
-        """Return the pixels of B * C disks with the sphere's motion (B, 6) while the shutter is open; None: at rest."""
+        """Return the pixels of B * C disks with the sphere's motion (B, 6) during the exposure; None: at rest."""
         if moved is None or instants == 1:
             return self
         return replace(self, moved=moved.repeat_interleave(len(self) // len(moved), 0), instants=instants)
@@ -78,13 +78,13 @@ class Pixels:
 
 def whole_vectors(count: int) -> int:
     """Return the largest number up to `count` that fills the processor's vectors.
-    The remainder takes other code whose last bits differ, so that a disk would depend on its batch.
+    The remainder runs other code with other last bits, so that a disk would depend on its batch.
     """
     return max(count // VECTOR, 1) * VECTOR
 
 
 def thinned_places(count: int, step: int) -> slice:
-    """Return which of `count` places `Pixels.thinned` keeps."""
+    """Return which of `count` places `Pixels.thinned` keeps, as a slice."""
     return slice(None, step * whole_vectors(len(range(0, count, step))), step)
 
 
@@ -112,13 +112,13 @@ class LinesOfSight:
         self.pitch_mm = _to_next_pixel(self.origin, self.direction) if apart else torch.zeros(1, 1)
 
     def pitch(self, u: int, v: int) -> tuple[Tensor, Tensor]:
-        """Return the change of the line of sight to the next pixel: angle, rad, and start, mm; each (1,)."""
+        """Return the change of the line of sight to the next pixel: angle, rad, and origin, mm; each (1,)."""
         there = self.pitch_mm.shape[0] > 1
         return self.pitch_rad[v, u : u + 1], self.pitch_mm[v * there, u * there : u * there + 1]
 
     def axes_at(self, middle_px: Tensor) -> Tensor:
-        """Return x and y of disks about B places (B, 2), px, in the lab, (B, 2, 3): the camera's. Those of a fisheye
-        camera are turned to the line of sight, which may be along its x.
+        """Return x and y of disks about B places (B, 2), px, in the lab, (B, 2, 3): the camera's. For a fisheye camera
+        they are rotated to the line of sight, which may lie along its x.
         """
         if not self.wide:
             return self.axes.expand(len(middle_px), 2, 3)
@@ -139,15 +139,15 @@ class LinesOfSight:
 
     def of_size(self, middle_px: NDArray[np.float64], mm_px: float) -> tuple[NDArray[np.float64], ...]:
         """Return the lines of sight nearest to B places (B, 2), px: direction (B, 3), the point (B, 3), lab, mm, where
-        a pixel is `mm_px` wide, and its distance (B,), mm, from their origin; of parallel ones their origin.
+        a pixel is `mm_px` wide, and its distance (B,), mm, from the origin; the origin if lines are parallel.
         """
         direction, origin, pitch_rad, pitch_mm = self.about(middle_px)
         distance = np.divide(mm_px - pitch_mm, pitch_rad, out=np.zeros_like(pitch_rad), where=pitch_rad > 0)
         return direction, origin + distance[:, None] * direction, distance
 
     def places(self, middle_px: NDArray[np.float64], stencil: "Stencil") -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return the pixels of the places of B disks about (B, 2), px, as indices of the flattened picture, the nearest
-        ones at its border, and which places are inside of it, (B, P) each.
+        """Return the pixels of B disks about (B, 2), px, as indices of the flattened picture (places outside get the
+        nearest pixel of its border), and which places are inside, (B, P) each.
         """
         (width, height), (u, v) = self.size, np.rint(middle_px).astype(np.int64).T[..., None]
         columns, rows = u + stencil.right, v + stencil.down
@@ -163,8 +163,8 @@ class LinesOfSight:
 
 
 def _to_next_pixel(field: Tensor, sight: Tensor | None = None) -> Tensor:
-    """Return the mean length of a field's (3, H, W) change to the right and below, (H - 1, W - 1).
-    Of changes across lines of sight (3, H, W) where these are given.
+    """Return the mean length of a field's (3, H, W) change to the right and below, (H - 1, W - 1); only of the change
+    across lines of sight (3, H, W) if these are given.
     """
     here = (slice(None), slice(None, -1), slice(None, -1))
     lengths = []
@@ -178,7 +178,7 @@ def _to_next_pixel(field: Tensor, sight: Tensor | None = None) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Stencil:
-    """Places of a disk about its middle pixel, in order of distance, at one step in pixels; made by `disk_stencil`."""
+    """Places of a disk about its middle pixel, in order of distance."""
 
     right: NDArray[np.int64]  # (P,), px
     down: NDArray[np.int64]
@@ -190,16 +190,14 @@ class Stencil:
 
 @lru_cache(maxsize=64)
 def disk_stencil(radius_px: float, step_px: int = 1, blur_px: float = 0.0) -> Stencil:
-    """Return all places within a radius, `step_px` apart. Errors of the model of paint that is blurred by `blur_px`
-    reach as far as tiles do; there are some on every disk.
-    """
+    """Return all places within a radius, `step_px` apart, with several tiles, by the blur, on every disk."""
     tile_px = max(round(min(TILE_BLURS * blur_px, radius_px / FEWEST_TILES)), TILE_PX, step_px)
     reach = math.ceil(radius_px)
     at = np.arange(-reach, reach + 1)
     at = at[at % step_px == 0]
     down, right = (grid.reshape(-1) for grid in np.meshgrid(at, at, indexing="ij"))
     distance2 = right**2 + down**2
-    # Random order among equals: every second place of a list row by row would be the disk's left half.
+    # Random order at equal distance: in row order every second place could be the disk's left half.
     order = np.lexsort((np.random.default_rng(0).random(len(distance2)), distance2))
     order = order[: whole_vectors(int((distance2 <= radius_px**2).sum()))]
     right, down = right[order], down[order]
@@ -223,7 +221,7 @@ def thinned_stencil(stencil: Stencil, step: int) -> Stencil:
 def window_of(
     middle_px: tuple[float, float], stencil: Stencil, blur_px: float, size: tuple[int, int]
 ) -> tuple[int, int, int, int]:
-    """Return left, top, right and bottom, included, px, of what `cut_pixels` reads of a frame of `size` (W, H)."""
+    """Return the region `cut_pixels` reads of a frame of `size` (W, H): left, top, right, bottom, included, px."""
     reach = stencil.reach + math.ceil(3 * blur_px)
     (left, right), (top, bottom) = (
         [min(max(round(middle) + side, 0), count - 1) for side in (-reach, reach)]
@@ -241,7 +239,7 @@ def cut_pixels(
     blur_px: float = 0.0,
 ) -> Pixels:
     """Return a disk's pixels about middle_px (u, v) without resampling, so that the noise of neighbours is independent.
-    A Gaussian of blur_px is laid over the frame (H, W) and the background's mean, for coarse fits.
+    For coarse fits a Gaussian blur of blur_px is applied to the frame (H, W) and the background's mean.
     """
     width, height = sight.size
     u, v = round(middle_px[0]), round(middle_px[1])

@@ -18,31 +18,31 @@ from sphereorient.pose.poses import FittedPoses, PoseStart, blank_parts
 from sphereorient.so3 import check_rotations
 from sphereorient.sphere.texture import known_paint
 
-NOISE = 1.0  # grey levels, of a background of one grey
-LEAST_SCORE = 0.5  # of right poses 0.9 and more; of fits that ended elsewhere 0.4 at most
+NOISE = 1.0  # grey levels, of a uniform background
+LEAST_SCORE = 0.5  # right poses have 0.9 and more, wrong ones 0.4 at most
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseFit:
-    """Poses that `PoseFitter` ended at, of any leading shape; float64. Those without `success` are no measurement."""
+    """Poses that `PoseFitter` found, of any leading shape; float64. Poses without `success` are no measurement."""
 
     R_lab_body: Tensor  # (..., 3, 3)
     position_lab_mm: Tensor  # (..., 3)
     covariance: Tensor  # (..., 6, 6), of delta (rad, lab) and position (mm); NaN without success
-    score: Tensor  # (..., C), share of each picture's variance that the pose explains, 1 at best; 0: of unseen paint
+    score: Tensor  # (..., C), share of each picture's variance that the pose explains, at most 1; 0: unseen paint
     explained: Tensor  # (...) bool, whether the scores' mean is at least 0.5
     converged: Tensor  # (...) bool, whether the last step was shorter than 0.006 rad
 
     @property
     def success(self) -> Tensor:
-        """Whether the pose explains the pictures and the fit came to rest there, (...) bool."""
+        """Whether the pose explains the pictures and the fit converged, (...) bool."""
         return self.explained & self.converged
 
     @property
     def reason(self) -> list[str]:
-        """Why a pose is none, of each pose one after the other; empty where it is one."""
+        """Why each pose failed, one text per pose; empty for a success."""
         each = zip(self.explained.flatten().tolist(), self.converged.flatten().tolist(), strict=True)
-        none, on = "the pose does not explain the pictures: start nearer", "the last step was long: go on from here"
+        none, on = "the pose does not explain the pictures: start nearer", "the last step was long: start again here"
         return [("" if rests else on) if explains else none for explains, rests in each]
 
 
@@ -51,14 +51,14 @@ class PoseFitter(nn.Module):
 
     Args:
         cameras: one, or C of them.
-        texture: (H, 2 H), the texture map, 0 black .. 1 white, NaN of no known paint: that does not count.
+        texture: (H, 2 H), the texture map, 0 black .. 1 white; NaN: unknown paint, not used.
         radius_mm: of the sphere.
         diameter_px: expected diameter of the sphere's disk in the pictures.
         blur_px: standard deviation of optics, pixel and exposure together, px.
         background: (C, H, W), grey levels of the scene without the sphere; None: black.
 
     Raises:
-        CameraError: something else than cameras.
+        CameraError: not a camera.
         SettingsError: radius or diameter not above 0.
         ShapeError: texture is not (H, 2 H), or not of numbers 0 .. 1.
     """
@@ -102,12 +102,12 @@ class PoseFitter(nn.Module):
         R_lab_body: ArrayLike | Tensor,
         position_lab_mm: ArrayLike | Tensor,
     ) -> PoseFit:
-        """Return the poses at which fits from a start (..., 3, 3), (..., 3) ended, and whether they are right.
+        """Return the poses found from a start (..., 3, 3), (..., 3), and whether they are right.
         Pictures (..., C, H, W) are grey levels, (..., H, W) for a single camera; the start is right to about 10 degrees
         and a few pixels.
 
         Raises:
-            ShapeError: shapes that do not fit together, starts that are no rotations, pictures that are not finite.
+            ShapeError: shapes that do not agree, starts that are no rotations, pictures that are not finite.
         """
         R, X = tensor_of("R_lab_body", R_lab_body).double(), tensor_of("position_lab_mm", position_lab_mm).double()
         check_rotations("R_lab_body", R)
@@ -130,7 +130,7 @@ class PoseFitter(nn.Module):
         fit = FittedPoses(**blank_parts(len(views), 0))
         if len(R):
             fit = fitter.fit_through(fitter.optics.steps, frames, PoseStart(X, R, use))
-        seen = (fit.score != 0).sum(1).clamp_min(1)  # cameras to which hardly any known paint is turned have 0
+        seen = (fit.score != 0).sum(1).clamp_min(1)  # cameras that see hardly any known paint have 0
         explained, converged = fit.score.sum(1) >= LEAST_SCORE * seen, fit.step[:, :3].norm(dim=1) < NEAR_RAD
         found = {name: getattr(fit, name) for name in ("R_lab_body", "position_lab_mm", "score")}
         found |= {"explained": explained, "converged": converged}

@@ -1,4 +1,4 @@
-"""Where fits of poses begin, and what they return; the poses of one frame, and of all frames, padded, for the path."""
+"""Start and result of fits of poses; the poses of one frame, and of all frames, padded, for the path."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -15,14 +15,14 @@ from sphereorient.pose.pixels import Pixels
 
 @dataclass(frozen=True, eq=False)
 class PoseStart:
-    """Where the fit of B poses begins."""
+    """Start of the fit of B poses."""
 
     position_lab_mm: Tensor  # (B, 3)
     R_lab_body: Tensor  # (B, 3, 3)
-    use: Tensor  # (B, C) bool, the cameras that see the sphere; a pose without any stays
-    place_precision: Tensor | None = None  # (B, 3, 3), 1/mm^2, of `position_lab_mm` as known beforehand
-    moved: Tensor | None = None  # (B, 6), turn (rad) and move (mm) while the shutter is open; None: as if at rest
-    held: bool = False  # whether each step begins at the given position
+    use: Tensor  # (B, C) bool, cameras that see the sphere; a pose without any is not changed
+    place_precision: Tensor | None = None  # (B, 3, 3), 1/mm^2, prior of `position_lab_mm`
+    moved: Tensor | None = None  # (B, 6), rotation (rad) and displacement (mm) during the exposure; None: at rest
+    held: bool = False  # whether each step starts at the given position
     among: Neighbours | None = None  # None: no other sphere is in view
 
     def of(self, rows: Tensor) -> "PoseStart":
@@ -31,33 +31,33 @@ class PoseStart:
         return replace(self, **parts, among=None if self.among is None else self.among.of(rows))
 
     def after(self, fit: "FittedPoses") -> "PoseStart":
-        """Return the start of a further fit, after one that ended there."""
+        """Return the start of a further fit from the poses of one."""
         X = self.position_lab_mm if self.held else fit.position_lab_mm
         return replace(self, position_lab_mm=X, R_lab_body=fit.R_lab_body)
 
 
 def _of(*shape: int) -> dict[str, tuple[int, ...]]:
-    """Return the shape of a part of `FittedPoses` beyond the leading one; -1: of each camera."""
+    """Return the shape of a part of `FittedPoses` after the leading one; -1: per camera."""
     return {"shape": shape}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FittedPoses:
-    """Poses fitted to the pictures of C cameras, with covariance; float64, of any leading shape.
-    Compiled code writes the parts in this order.
-    """
+    """Fitted poses of C cameras, float64, of any leading shape; compiled code writes the parts in this order."""
 
     position_lab_mm: Tensor = field(metadata=_of(3))
     R_lab_body: Tensor = field(metadata=_of(3, 3))
     covariance: Tensor = field(metadata=_of(6, 6))  # of delta (rad) and position (mm), lab
     own_turn: Tensor = field(metadata=_of(-1, 3))  # rad: rotation of the pose by each camera alone, position held
     own_covariance: Tensor = field(metadata=_of(-1, 3, 3))  # rad^2
-    # mm, lab: how each camera alone would move the sphere, distance by size included.
+    # mm, lab: displacement of the pose by each camera alone, with distance by size.
     own_move: Tensor = field(metadata=_of(-1, 3))
-    own_sigma_mm: Tensor = field(metadata=_of(-1))  # of the place by each camera alone, across its line of sight
-    limb_coverage: Tensor = field(metadata=_of(-1))  # 0 to 1: share of the limb whose pixels count
-    excess: Tensor = field(metadata=_of(-1))  # deviation of own rotation over that of independent noise; right model: 1
-    # 1 less the share of the picture's variance that is left; 0 of hardly any known paint.
+    own_sigma_mm: Tensor = field(metadata=_of(-1))  # of the position by each camera alone, across its line of sight
+    limb_coverage: Tensor = field(metadata=_of(-1))  # 0 to 1: share of the limb whose pixels are used
+    excess: Tensor = field(
+        metadata=_of(-1)
+    )  # ratio of own rotation's scatter to independent noise; 1 for a right model
+    # Explained share of the picture's variance; 0 if hardly any paint is known.
     score: Tensor = field(metadata=_of(-1))
     nll: Tensor = field(metadata=_of())  # negative log-likelihood of all pixels, as if they were independent
     step: Tensor = field(metadata=_of(6))  # the last one of the fit
@@ -91,7 +91,7 @@ POSE_PARTS = tuple(SHAPES)
 
 
 def pose_arrays(cameras: int, *shape: int) -> dict[str, Tensor]:
-    """Return the arrays of `FittedPoses` of a leading shape, zeros."""
+    """Return the zero arrays of `FittedPoses` of a leading shape."""
     return {
         name: torch.zeros(*shape, *(cameras if n < 0 else n for n in tail), dtype=torch.float64)
         for name, tail in SHAPES.items()
@@ -99,7 +99,7 @@ def pose_arrays(cameras: int, *shape: int) -> dict[str, Tensor]:
 
 
 def blank_parts(cameras: int, *shape: int) -> dict[str, Tensor]:
-    """Return the same with the unit rotation."""
+    """Return `pose_arrays` with unit rotations."""
     parts = pose_arrays(cameras, *shape)
     return parts | {"R_lab_body": parts["R_lab_body"] + torch.eye(3, dtype=torch.float64)}
 
@@ -108,7 +108,7 @@ Record = TypeVar("Record", Pixels, PoseStart, FittedPoses)
 
 
 def moved_to(device: torch.device, record: Record) -> Record:
-    """Return a record with its tensors on a device; all of them are on one."""
+    """Return a record with its tensors on a device."""
     tensors: dict[str, Any] = {name: part for name, part in vars(record).items() if isinstance(part, Tensor)}
     if next(iter(tensors.values())).device == device:
         return record
@@ -117,9 +117,9 @@ def moved_to(device: torch.device, record: Record) -> Record:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Poses(FittedPoses):
-    """Distinct poses (M) that one frame's pictures allow, most likely first; M = 0: `reason` says why."""
+    """Distinct poses (M) consistent with one frame's pictures, likeliest first; for M = 0, `reason` says why."""
 
-    use: Tensor  # (C,) bool, cameras whose pictures count
+    use: Tensor  # (C,) bool, cameras whose pictures are used
     reason: tuple[Reason, ...]  # C
 
     def __len__(self) -> int:
@@ -132,13 +132,13 @@ def poses_of(fit: FittedPoses, chosen: Tensor | slice, use: Tensor, reason: Sequ
 
 
 def best_poses(found: Sequence[Poses]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return positions (n, 3), rotations (n, 3, 3) and use (n, C) of the likeliest poses of n frames that have one."""
+    """Return positions (n, 3), rotations (n, 3, 3) and use (n, C) of the likeliest poses of n frames with poses."""
     X, R = (torch.cat([getattr(one, name)[:1] for one in found]) for name in ("position_lab_mm", "R_lab_body"))
     return X, R, torch.stack([one.use for one in found])
 
 
 def no_pose(cameras: int, reason: Sequence[Reason], use: Tensor | None = None) -> Poses:
-    """Return a frame without any pose; of a camera with the reason OK the score was too low."""
+    """Return a frame without poses; a camera with the reason OK had too low a score."""
     use = torch.zeros(cameras, dtype=torch.bool) if use is None else use
     why = tuple(Reason.LOW_SCORE if one is Reason.OK else one for one in reason)
     return Poses(**blank_parts(cameras, 0), use=use, reason=why)
@@ -146,7 +146,7 @@ def no_pose(cameras: int, reason: Sequence[Reason], use: Tensor | None = None) -
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseTable(FittedPoses):
-    """Poses of N frames, padded to (N, M) with zeros and the unit rotation, likeliest first; `nll` above the best."""
+    """Poses of N frames, padded to (N, M), likeliest first; `nll` relative to the best."""
 
     mask: Tensor  # (N, M) bool
     use: Tensor  # (N, C) bool
@@ -156,7 +156,7 @@ class PoseTable(FittedPoses):
         return len(self.mask)
 
     def rows(self, choice: Tensor) -> dict[str, Tensor]:
-        """Return each part at one place per frame, (N, ...); NaN where the choice (N,) is negative."""
+        """Return each part of the chosen pose per frame, (N, ...); NaN where the choice (N,) is negative."""
         frame, none = torch.arange(len(self)), choice < 0
         chosen: dict[str, Tensor] = {}
         for name, whole in self.parts().items():
@@ -178,14 +178,14 @@ class PoseTable(FittedPoses):
 
 
 def turned_alone(picked: Mapping[str, Tensor], camera: int) -> Tensor:
-    """Return R_lab_body (N, 3, 3) of poses, as `PoseTable.rows`, by one camera alone."""
+    """Return R_lab_body (N, 3, 3) by one camera alone, of poses from `PoseTable.rows`."""
     return so3.exp(picked["own_turn"][:, camera]) @ picked["R_lab_body"]
 
 
 def pose_tables(
     batches: Iterable[Mapping[str, Sequence[Poses]]], names: Iterable[str], cameras: int
 ) -> dict[str, PoseTable]:
-    """Put the poses of each ball in N frames, given batch by batch, into arrays."""
+    """Return the poses of each ball in N frames, given batch by batch, as arrays."""
     flat: dict[str, list[dict[str, Tensor]]] = {name: [] for name in names}
     counts: dict[str, list[int]] = {name: [] for name in flat}
     reason: dict[str, list[tuple[Reason, ...]]] = {name: [] for name in flat}
@@ -199,7 +199,7 @@ def pose_tables(
 
 
 def pose_table(frames: Sequence[Poses], cameras: int) -> PoseTable:
-    """Put the poses of one ball in N frames into arrays."""
+    """Return the poses of one ball in N frames as arrays."""
     (table,) = pose_tables([{"only": frames}], ["only"], cameras).values()
     return table
 
@@ -216,7 +216,7 @@ def _padded(
 
 
 def exchanged(tables: Sequence[PoseTable], row: Tensor) -> list[PoseTable]:
-    """Return the tables of K balls of which ball k in frame n is the one of table `row` (K, N)."""
+    """Return the tables of K balls, reassigned: ball k in frame n is that of table `row` (K, N)."""
     frame, (count, cameras) = torch.arange(row.shape[1]), (len(row), tables[0].use.shape[1])
     most = max(table.mask.shape[1] for table in tables)
     mask = torch.zeros(count, len(frame), most, dtype=torch.bool)

@@ -1,5 +1,5 @@
-"""The linear problem of the fit: residuals of L disks at given poses, their sums, how well they are explained, and what
-they tell of stray light beside the sphere and of the noise of each camera.
+"""The linear problem of the fit: residuals of L disks at given poses, their sums and scores, and the estimates of stray
+light beside the sphere and of each camera's noise.
 """
 
 import math
@@ -25,13 +25,13 @@ from sphereorient.pose.view import sphere_view
 from sphereorient.so3 import solve_damped
 from sphereorient.sphere.view import polynomials
 
-TUKEY = 14.0  # standard deviations beyond which a pixel does not count; a misfit edge must still pull, a bubble not
+TUKEY = 14.0  # standard deviations beyond which a pixel is not used; a displaced edge is still used, a bubble is not
 KNOWN = 0.3  # least share of a disk that shows known paint
-EDGE_PX = 0.005  # by how much the model's limb may lie off in all directions alike: no blur is known any better
-SMOOTH = 4  # order of the light and reflections that a disk without paint shows; as those of a first fit
-OUTLIERS = 4.0  # times the variance of the disk, beyond which a square counts alike
-NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone makes 1/12
-NO_SPHERE = 0.01  # share of a pixel; less of the sphere shows nothing of it
+EDGE_PX = 0.005  # possible radial error of the model's limb: no blur is known better
+SMOOTH = 4  # order of light and reflections on a disk without paint, as in a first fit
+OUTLIERS = 4.0  # limit of a square, in variances of the disk
+NOISE_MIN = 0.25  # grey levels^2; rounding to whole levels alone gives 1/12
+NO_SPHERE = 0.01  # share of a pixel; below it the sphere is not visible
 STRAY_ROUNDS, STRAY_TUKEY, FEWEST_BESIDE = 5, 6.0, 200  # rounds, standard deviations, pixels
 STRAY_LEAST = 0.05  # coefficients, summed, of the step from black to white paint: clean pictures 0.01, glare 0.13
 
@@ -41,12 +41,12 @@ class Residuals:
     """The linear problem at one pose, of L disks; made by `residuals`."""
 
     view: SphereView
-    design: Tensor  # (L, 6 + K, P), derivatives by pose and by the light's coefficients
+    design: Tensor  # (L, 6 + K, P), derivatives by pose and light coefficients
     residual: Tensor  # (L, P), grey levels
     model: Tensor  # (L, P), grey levels
     variance: Tensor  # (L, P), expected
     weight: Tensor  # (L, P), robust and inside, 0 .. 1
-    inside: Tensor  # (L, P) bool, the pixels that count: of known paint
+    inside: Tensor  # (L, P) bool, pixels used: of known paint
     deviation: Tensor  # (L,), robust standard deviation of the residuals over the noise expected
     lit: Tensor  # (L, P), grey levels from black to white paint, the frame's own light included, coverage too
     over: Tensor  # (L, P), grey levels of the sphere above the background
@@ -54,9 +54,7 @@ class Residuals:
 
 
 def disk_sums(at: Residuals) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the linear problem of L disks as sums, the light's coefficients eliminated, see `without_light`: float64,
-    of delta (rad) and position (mm).
-    """
+    """Return the problem as sums, float64, without light coefficients (`without_light`); of delta (rad) and mm."""
     weighted = at.design * (at.weight / at.variance)[:, None]
     return without_light((weighted @ at.design.mT).double(), (weighted @ at.residual[..., None])[..., 0].double())
 
@@ -64,7 +62,7 @@ def disk_sums(at: Residuals) -> tuple[Tensor, Tensor, Tensor]:
 def residuals(
     pixels: Pixels, X: Tensor, R: Tensor, state: tuple[Tensor, Tensor] | None, model: SphereModel
 ) -> Residuals:
-    """Linearise the pictures of B * C disks about poses X (B, 3), mm, R_lab_body R (B, 3, 3), the light at its best.
+    """Linearise the pictures of B * C disks about poses X (B, 3), mm, R_lab_body R (B, 3, 3), at the best light.
     `state`: expected grey levels and weights of an earlier call, (L, P) each; None: from the picture itself.
     """
     cameras = len(model.light.noise)
@@ -80,7 +78,7 @@ def residuals(
     noise = model.light.noise.repeat(len(X), 1)
     inside = pixels.inside if view.known is None else pixels.inside & view.known
     target = pixels.grey - beyond
-    # The first weights come from the picture itself, bubbles included; a second round does without it.
+    # The first weights come from the picture itself, with bubbles; the second ones from the model.
     rounds = (pixels.grey, (inside & ~pixels.clipped).to(columns.dtype)) if state is None else state
     for _ in range(1 if state is not None else 2):
         expected, weight = rounds
@@ -90,7 +88,7 @@ def residuals(
         ).to(columns.dtype)
         painted = (coefficients[:, None] @ columns)[:, 0]
         grey, residual = painted + beyond, target - painted
-        # A saturated pixel tells only that its grey level is at least this one.
+        # The true grey level of a saturated pixel is at least this one.
         silent = pixels.clipped & (residual <= 0)
         residual = residual.masked_fill(silent, 0.0)
         variance = noise_variance(grey, noise)
@@ -157,7 +155,7 @@ def tile_scores(at: Residuals, mixed: Tensor, tile: Tensor) -> Tensor:
 
 
 def noise_variance(grey: Tensor, noise: Tensor) -> Tensor:
-    """Return the noise variance expected at grey levels (L, P) by the curves (L, 4)."""
+    """Return the noise variance at grey levels (L, P) by the curves (L, 4)."""
     grey = grey.clamp_min(0.0)
     a, b, c, d = noise[..., None].unbind(1)
     variance: Tensor = a + grey * (b + grey * (c + grey * d))
@@ -165,7 +163,7 @@ def noise_variance(grey: Tensor, noise: Tensor) -> Tensor:
 
 
 def robust_deviation(residual: Tensor, variance: Tensor, inside: Tensor) -> Tensor:
-    """Return the robust standard deviation of residuals over the noise expected, (L,), at least 1."""
+    """Return the robust standard deviation of residuals over the expected noise, (L,), at least 1."""
     residual, variance, inside = (part[:, ::EVERY] for part in (residual, variance, inside))
     scaled = torch.where(inside, residual.abs() * variance.rsqrt(), torch.nan)
     return 1.4826 * torch.nan_to_num(scaled.nanmedian(-1).values)
@@ -181,11 +179,10 @@ def loss_of(at: Residuals, inside: Tensor) -> Tensor:
 
 
 def scores_of(at: Residuals, pixels: Pixels) -> Tensor:
-    """Return how much better the painted sphere explains L disks than what has no paint does, (L,), -1 .. 1.
-    1 - painted / min(smooth, scene), of the mean squares that three models leave in every fourth pixel: the sphere at
-    this pose; a disk whose grey level is a polynomial of order `SMOOTH`; the empty scene. An outlier counts up to a
-    limit; a saturated pixel that a model expects brighter is explained by it. 0 of a disk that shows hardly any known
-    paint.
+    """Return the explained variance of L disks by the painted sphere, relative to models without paint, (L,), -1 .. 1.
+    1 - painted / min(smooth, scene), from mean squared residuals of three models in every fourth pixel: the sphere at
+    this pose; a disk whose grey level is a polynomial of order `SMOOTH`; the empty scene. Squares of outliers are
+    limited; a saturated pixel that a model expects brighter has residual 0. 0 for a disk with hardly any known paint.
     """
     cover, counted = at.view.coverage, at.inside
     known = (cover * counted).sum(-1) > KNOWN * cover.sum(-1)
@@ -207,15 +204,15 @@ def scores_of(at: Residuals, pixels: Pixels) -> Tensor:
 
 
 def learn_stray(at: Residuals, pixels: Pixels, use: Tensor, known: Tensor) -> Tensor:
-    """Estimate the stray light (C, K) from pixels that no sphere covers in B * C disks, those of `use` (B, C) bool.
-    `known` (C, K) is the one that the residuals hold. Robust: bubbles and other passers-by count for nothing. Light as
-    weak as the errors of the model of the limb is taken for none.
+    """Estimate the stray light (C, K) from pixels outside all spheres in B * C disks, those in `use` (B, C) bool.
+    `known` (C, K): the stray light in the residuals' model. The estimate is robust against passing bubbles. Stray light
+    below the model error of the limb is set to 0.
     """
     beside = at.inside & ~pixels.clipped & (at.view.coverage < NO_SPHERE) & use.reshape(-1, 1)
     beside[:, : pixels.inner] = False
     cameras = use.shape[1]
     found = torch.zeros_like(known)
-    stray_known = scene_beside(at.view, pixels, known) - pixels.behind  # less what the sphere's edge adds
+    stray_known = scene_beside(at.view, pixels, known) - pixels.behind  # less the sphere's part at its edge
     for camera in range(cameras):
         own = slice(camera, None, cameras)
         basis = stray_basis(at.view.across[own]).mT[beside[own]].double()
@@ -241,14 +238,14 @@ def noise_curves(model: Tensor, residual: Tensor, inside: Tensor, cameras: int) 
 
 
 def noise_curve(model: Tensor, residual: Tensor, inside: Tensor) -> Tensor:
-    """Return the noise variance's coefficients (4,), not negative, in the grey level, from pixels (N,) inside."""
+    """Return the coefficients (4,), not negative, of the noise variance in the grey level, from pixels (N,) inside."""
     model, residual = model[inside].clamp_min(0).double(), residual[inside].double()
     order = model.argsort(stable=True)
     groups = [group for group in order.tensor_split(24) if len(group) >= 50]
     if len(groups) < 3:
         return torch.tensor([float(residual.square().mean()) if len(residual) else 1.0, 0.0, 0.0, 0.0])
     at = torch.stack([model[group].mean() for group in groups])
-    # Robust: the paint's borders leave residuals that are not noise.
+    # Robust: residuals at the paint's borders are not noise.
     seen = torch.stack([(1.4826 * residual[group].abs().median()).square() for group in groups]).clamp_min(0.1)
     design = torch.stack([at**power for power in range(4)], dim=-1) / seen[:, None]
     return torch.from_numpy(nnls(design.numpy(), np.ones(len(groups)))[0]).float()

@@ -1,4 +1,4 @@
-"""The painted sphere in the pixels of a camera, blurred, and its derivatives by the pose."""
+"""The painted sphere in the pixels of a camera, blurred, with its derivatives by the pose."""
 
 import math
 from collections.abc import Sequence
@@ -14,15 +14,15 @@ from sphereorient.pose.pixels import Pixels
 from sphereorient.so3 import cross_first_axis
 from sphereorient.sphere.view import nearest_approach
 
-SPREAD_MIN = 0.02  # least share of the blur's variance left inside the limb: keeps the look-up off the limb itself
+SPREAD_MIN = 0.02  # least share of the blur's variance inside the limb: keeps the look-up away from the limb
 RIM_NODES = 6  # look-ups along the radius near the limb, where the paint is compressed
 DEPTH_MIN = 0.03  # least depth of a look-up below the limb, radii: the slope of the paint is infinite on the limb
-COVER_MIN = 1e-4  # of a pixel, so that paint beyond the limb has a value
+COVER_MIN = 1e-4  # of a pixel, so that paint is defined beyond the limb
 
 
 def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model: SphereModel) -> SphereView:
     """Render the sphere at position_lab_mm (L, 3) and R_lab_body (L, 3, 3) through pixels with a Gaussian aperture.
-    Where it moves during the exposure, the mean of `pixels.instants` instants of it, the pose in the middle.
+    If it moves during the exposure: the mean of `pixels.instants` instants, with the given pose in the middle.
     """
     X, R = position_lab_mm, R_lab_body
     if pixels.instants == 1:
@@ -34,13 +34,13 @@ def sphere_view(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, mod
 
 @cache
 def exposure_instants(instants: int) -> tuple[list[float], list[float]]:
-    """Return instants from -1/2 to 1/2 of the exposure, and their shares of its light: Gauss-Legendre quadrature."""
+    """Return instants from -1/2 to 1/2 of the exposure, and their weights: Gauss-Legendre quadrature."""
     nodes, weights = np.polynomial.legendre.leggauss(instants)
     return (nodes / 2).tolist(), (weights / 2).tolist()
 
 
 def _mean_view(views: Sequence[SphereView], shares: Sequence[float]) -> SphereView:
-    """Return the mean of views, each of a share of the exposure; paint counts as far as the sphere covers the pixel."""
+    """Return the weighted mean of views over the exposure; paint is weighted by coverage as well."""
 
     def mean(parts: Sequence[Tensor]) -> Tensor:
         total = parts[0] * shares[0]
@@ -79,7 +79,7 @@ def _view_at(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model:
     radius_mm, blur_px = model.radius_mm, model.blur_px
     d = pixels.direction
     R = R_lab_body.to(d.dtype)
-    # In double precision, once: half a metre less half a metre.
+    # In double precision: the difference of two distances of half a metre.
     to_centre = (position_lab_mm[:, :, None] - pixels.origin.double()).to(d.dtype)
     aside = nearest_approach(to_centre, d, 1)
     nearest = (aside * aside).sum(1).sqrt().clamp_min(1e-6 * radius_mm)
@@ -87,12 +87,12 @@ def _view_at(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model:
     q0 = nearest / radius_mm
     distance = to_centre[..., 0].norm(dim=1, keepdim=True)
     blur = blur_px * (pixels.pitch_mm[:, None] + pixels.pitch_rad[:, None] * distance) / radius_mm
-    # Half of an aperture on the limb of a disk lies within blur^2 / 2 less than within a straight edge.
+    # The limb is curved: an aperture is half covered blur^2 / 2 radii inside it.
     edge = (1.0 - 0.5 * blur * blur - q0) / blur
     coverage, density, pull, variance = limb_shape(edge)
     q = (q0 - blur * pull).clamp(0.0, 1.0)
     inner = pixels.inner
-    # The paint's blur is even over the surface: its mean lies as much nearer to the middle than that of the aperture.
+    # The paint's blur is uniform over the surface: its mean is shifted by as much towards the disk's middle.
     seen = q * (1.0 + blur * blur * variance)
     variance, middle = variance[:, :inner], seen[:, :inner]
     spread = blur * variance.sqrt() * middle
@@ -121,8 +121,8 @@ def _view_at(pixels: Pixels, position_lab_mm: Tensor, R_lab_body: Tensor, model:
 
 
 def limb_shape(edge: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return how a limb cuts a Gaussian aperture `edge` (...) standard deviations inside of it: the share that is left,
-    the density at the limb, how far the mean of the rest lies inwards (deviations), and its variance.
+    """Return how a limb cuts a Gaussian aperture `edge` (...) standard deviations inside it: the share that is left,
+    the density at the limb, the inward shift of the rest's mean (standard deviations), and its variance.
     """
     coverage = torch.special.ndtr(edge)
     density = torch.exp(-0.5 * edge * edge) * (1.0 / math.sqrt(2.0 * math.pi))
@@ -131,27 +131,27 @@ def limb_shape(edge: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def rim_shape(coverage: Tensor, density: Tensor) -> tuple[Tensor, Tensor]:
-    """Return look-ups along the radius near the limb, the means of equal parts of the cut-off Gaussian in standard
-    deviations, and how far each moves with the sphere, (L, n, P) each, of coverage and density (L, 1, P).
-    Paint that is linear within each part is averaged exactly. With quantiles the ball is turned by 0.03 degrees.
+    """Return look-ups along the radius near the limb (the means of equal parts of the cut-off Gaussian, in standard
+    deviations), and how far each moves with the sphere, (L, n, P) each, for coverage and density (L, 1, P).
+    Paint that is linear within each part is averaged exactly. With quantiles the ball would be rotated by 0.03 degrees.
     """
     counted = coverage.clamp_min(1e-4)
     share = torch.arange(RIM_NODES + 1, dtype=coverage.dtype, device=coverage.device)[:, None] / RIM_NODES
     end = torch.special.ndtri((share * counted).clamp(1e-7, 1 - 1e-7))
     height = torch.exp(-0.5 * end * end) * (share > 0) * (1.0 / math.sqrt(2.0 * math.pi))
     z = -RIM_NODES * height.diff(dim=-2) / counted
-    # The limb holds a node back the more, the nearer it is.
+    # The nearer a node is to the limb, the less it moves.
     moves = 1.0 - density / counted * (RIM_NODES * (share * end).diff(dim=-2) - z)
     return z, moves.clamp(0.0, 1.0)
 
 
 def _sample(at: Tensor, moves: Tensor, line: Sequence[Tensor], R: Tensor, model: SphereModel) -> tuple[Tensor, ...]:
-    """Return the mean paint of look-ups (L, P), derivatives (L, 3, P), and, if not everywhere, where the paint is
-    known, (L, P) bool; `at` in radii, `moves` per pixel moved.
+    """Return the mean paint of look-ups (L, P), its derivatives (L, 3, P), and where the paint is known, (L, P) bool,
+    unless everywhere; `at` in radii, `moves` per pixel moved.
     `line`: direction and outward, unit (L, 3, P), and the distance from the centre (L, P), mm, of lines of sight.
     """
     d, outward, nearest = line
-    # In body components, as the texture: the derivatives are rotated back once, at the end.
+    # In body components, as the texture; the derivatives are rotated to the lab at the end.
     sight_b, outward_b = (R.mT @ d)[:, :, None], (R.mT @ outward)[:, :, None]
     qt = at.clamp(0.0, math.sqrt(1.0 - DEPTH_MIN**2))
     depth = (1.0 - qt * qt).sqrt()
@@ -160,12 +160,12 @@ def _sample(at: Tensor, moves: Tensor, line: Sequence[Tensor], R: Tensor, model:
     value, slope = value.reshape(qt.shape), slope.reshape(normal_b.shape)
     shares = [] if model.paint.unseen is None else [model.paint.unseen.sample(normal_b.flatten(2))[0]]
     known = [share.reshape(qt.shape).amax(1) < UNSEEN for share in shares]
-    # Moving the centre along -outward lets the look-up slide outwards over the sphere.
+    # If the centre moves along -outward, the look-up moves outwards over the sphere.
     slide = (slope * outward_b).sum(1) + qt / depth * (slope * sight_b).sum(1)
     radial = (moves * slide).mean(1)
     flat_b = (qt[:, None] * slope).mean(2)
     by_sight, by_outward = (flat_b * sight_b[:, :, 0]).sum(1), (flat_b * outward_b[:, :, 0]).sum(1)
-    # Across the radius a look-up stays at its share of it, q / q0.
+    # Across the radius a look-up moves by its share of the radius, q / q0.
     flat = R @ flat_b - by_sight[:, None] * d - by_outward[:, None] * outward
     shift = flat * (-1.0 / nearest)[:, None] - (radial / model.radius_mm)[:, None] * outward
     return value.mean(1), R @ cross_first_axis(slope, normal_b).mean(2), shift, *known

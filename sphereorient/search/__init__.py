@@ -1,4 +1,4 @@
-"""Orientation without history: normalisation, template banks, coarse to fine, candidates."""
+"""Search for the orientation without history: normalisation, template banks, coarse to fine, candidates."""
 
 from sphereorient.search.candidates import Candidates, FallbackProposer, Proposals, Proposer
 from sphereorient.search.grey_search import GreySearch

@@ -1,4 +1,4 @@
-"""Candidate orientations without history, and who proposes them."""
+"""Candidate orientations without history, and proposers."""
 
 import math
 from abc import ABC, abstractmethod
@@ -14,22 +14,22 @@ from torch.nn import functional as F
 
 from sphereorient.errors import Reason, ShapeError, check_finite, check_tail, refusal, tensor_of
 
-BATCH = 32  # disks at once: full ones give the same bits for any number of disks
-SAME_DEG = 12.0  # proposals of two proposers nearer than this are one
+BATCH = 32  # disks at once; full batches give the same bits for any number of disks
+SAME_DEG = 12.0  # nearer proposals of two proposers are the same
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Candidates:
-    """M possible orientations of N disks or frames; those of k are rows offset[k] .. offset[k + 1], best first."""
+    """M candidate orientations of N disks or frames; those of k are rows offset[k] .. offset[k + 1], best first."""
 
     offset: Tensor  # (N + 1,) int64, offset[0] = 0, offset[N] = M
     R_view_body: Tensor  # (M, 3, 3) float64
     score: Tensor  # (M,) float64, 0 .. 1
-    reason: tuple[Reason, ...]  # N, why there is no candidate; Reason.OK where there is one
-    R_lab_view: Tensor | None = None  # (N, 3, 3), of each frame; None before the camera is known
+    reason: tuple[Reason, ...]  # N, why there is no candidate; Reason.OK if there is one
+    R_lab_view: Tensor | None = None  # (N, 3, 3), of each frame; None if the camera is unknown
 
     def __post_init__(self) -> None:
-        """Compare the lengths of the parts."""
+        """Check the lengths of the parts."""
         check_tail("Candidates.R_view_body", self.R_view_body, 3, 3)
         rows = int(self.offset[-1])
         if not len(self.R_view_body) == len(self.score) == rows or len(self.reason) != len(self.offset) - 1:
@@ -39,7 +39,7 @@ class Candidates:
 
     @classmethod
     def of_disk(cls, R_view_body: Tensor, score: Tensor, otherwise: Reason = Reason.LOW_SCORE) -> Self:
-        """Return the candidates of one disk, (M, 3, 3) and (M,), best first; `otherwise` is why there is none."""
+        """Return the candidates of one disk, (M, 3, 3) and (M,), best first; `otherwise`: why there is none."""
         reason = (Reason.OK if len(score) else otherwise,)
         return cls(offset=torch.tensor([0, len(score)]), R_view_body=R_view_body, score=score, reason=reason)
 
@@ -83,11 +83,11 @@ class Candidates:
     @property
     def R_lab_body(self) -> Tensor:
         """Orientations in the lab, (M, 3, 3)."""
-        assert self.R_lab_view is not None  # set once the camera is known
+        assert self.R_lab_view is not None  # set when the camera is known
         return self.R_lab_view[torch.repeat_interleave(torch.arange(len(self)), self.counts)] @ self.R_view_body
 
     def spread(self, placed: Tensor, reason: Sequence[Reason]) -> Self:
-        """Return one entry per frame where only the frames `placed` (N,) bool had a disk; `reason` is of the others."""
+        """Return one entry per frame, if only the frames `placed` (N,) bool had a disk; `reason`: of the others."""
         counts = torch.zeros(len(placed), dtype=torch.int64)
         counts[placed] = self.counts
         own = iter(self.reason)
@@ -98,7 +98,7 @@ class Candidates:
         )
 
     def padded(self, views: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Return R_lab_body or R_view_body (N, C, 3, 3), scores and mask (N, C); unit rotation and 0 if unused."""
+        """Return R_lab_body or R_view_body (N, C, 3, 3), scores and mask (N, C); unused: unit rotation and 0."""
         R = self.R_view_body if views else self.R_lab_body
         mask = torch.arange(max([*self.counts.tolist(), 1])) < self.counts[:, None]
         rotations, score = torch.eye(3).to(R).repeat(*mask.shape, 1, 1), self.score.new_zeros(mask.shape)
@@ -120,11 +120,11 @@ def check_disks(disks: Tensor, height: int, width: int) -> None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Proposals:
-    """Possible orientations of disks of any leading shape, best first, padded with NaN; float64."""
+    """Candidate orientations of disks of any leading shape, best first, padded with NaN; float64."""
 
     R_view_body: Tensor  # (..., M, 3, 3)
     score: Tensor  # (..., M), 0 .. 1
-    reason: tuple[Reason, ...]  # of each disk, one after the other: why it has none; `OK` where it has one
+    reason: tuple[Reason, ...]  # of each disk: why it has none; `OK` if it has one
 
 
 class Proposer(nn.Module, ABC):
@@ -134,16 +134,14 @@ class Proposer(nn.Module, ABC):
 
     @abstractmethod
     def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
-        """Propose orientations for (F, S, S) float32 grey disks; a disk's answer depends on no other disk. `least`: in
-        place of `score_min` of templates.
-        """
+        """Propose orientations for (F, S, S) float32 grey disks, one by one. `least`: instead of `score_min`."""
 
     def rough(self, disks: Tensor) -> Candidates:
-        """Return the starts from which `propose` climbs: right to the step of its grid, in a quarter of the time."""
+        """Return the starts of the refinement in `propose`: right to the step of its grid, in a quarter of the time."""
         return self.propose(disks)
 
     def likeness(self, disks: Tensor) -> Tensor:
-        """Return how much disks (F, S, S) look like the ball in its best orientation, (F,); cheaper than `propose`."""
+        """Return the similarity of disks (F, S, S) to the ball in its best orientation, (F,); faster than `propose`."""
         return self.propose(disks).best_score
 
     def forward(self, disks: Tensor | NDArray[np.generic]) -> Proposals:
@@ -164,7 +162,7 @@ class Proposer(nn.Module, ABC):
 
 
 class FallbackProposer(Proposer):
-    """Asks one proposer, and a second one where no score reaches `sure`; the second's answers come first there."""
+    """Uses one proposer, and a second one if no score reaches `sure`; then the second's results come first."""
 
     def __init__(self, first: Proposer, second: Proposer, sure: float) -> None:
         super().__init__()
@@ -182,11 +180,11 @@ class FallbackProposer(Proposer):
         return Candidates.joined(found)
 
     def rough(self, disks: Tensor) -> Candidates:
-        """Return what the first proposer says."""
+        """Return the result of the first proposer."""
         return self._first.rough(disks)
 
     def likeness(self, disks: Tensor) -> Tensor:
-        """Return what the first proposer says."""
+        """Return the result of the first proposer."""
         return self._first.likeness(disks)
 
 
@@ -199,7 +197,7 @@ def resized(disks: Tensor, size_px: int) -> Tensor:
 
 
 def interleaved(one: Candidates, other: Candidates) -> Candidates:
-    """Return the proposals of two for one disk in turn, the first one's first, without duplicates."""
+    """Return the proposals of two for one disk alternately, the first one's first, without duplicates."""
     rank = torch.cat([2 * torch.arange(len(one.score)), 2 * torch.arange(len(other.score)) + 1])
     order = rank.argsort(stable=True)
     R = torch.cat([one.R_view_body, other.R_view_body])[order]

@@ -17,23 +17,23 @@ from sphereorient.search.settings import GreySearchSettings
 from sphereorient.sphere import orthographic_view, perspective_view
 from sphereorient.sphere.texture_table import texture_table
 
-# Disks normalised at once. Fixed, filled up with empty disks: the last bits of sums depend on their number.
-PRODUCT = 128  # disks in one product, at most: the scores of more leave the cache
+# Disks normalised at once; fixed, padded with empty disks, as the last bits of sums depend on their number.
+PRODUCT = 128  # most disks in one product, so that the scores stay in the cache
 GROUP = 8  # neighbouring templates, represented by their best one
-LOOKED_AT = 32  # best groups that are searched for peaks: a broad peak spans several
+LOOKED_AT = 32  # best groups searched for peaks, as a broad peak spans several
 TABLE_SIDE = 192  # cells of the paint table: 1 degree, below half of the finest detail
-DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, that becomes 127
+DEVIATIONS = 4.0  # value of a pixel, in root mean squares of its picture, mapped to 127
 
 
 class GreySearch(Proposer):
-    """Searches all of SO(3) on the CPU for the views of a texture map that look like a disk, under any smooth light.
+    """Searches all of SO(3) on the CPU for the views of a texture map that resemble a disk, under any smooth light.
     Detail finer than `detail` is removed, so that the nearest template of the Lattman grid still correlates.
 
     Args:
         texture: (H, 2 H), the texture map, 0 black .. 1 white.
         settings: of the search; None: the defaults.
-        blur: standard deviation of the pictures' own blur, radii, where it is not far below `detail`.
-        bank: (K, P) int8, that of another search with the same arguments; None: made when it is needed.
+        blur: standard deviation of the pictures' own blur, radii, unless far below `detail`.
+        bank: (K, P) int8, of another search with the same arguments; None: computed when needed.
     `size_px` is the side of the disks, `templates` (K, 3, 3) float32 are the rotations of the `bank`.
     """
 
@@ -55,7 +55,7 @@ class GreySearch(Proposer):
         self._rough = detail_level(self._view, self._paint, settings.detail, every=2, blur=blur)
         self._fine = detail_level(self._view, self._paint, pixel_rad, every=1, blur=blur)
         grid = so3.lattman_grid(math.radians(settings.step_deg)).float()
-        # (GROUP, G): each group is a column, so that its maximum is one of whole rows.
+        # (GROUP, G): each group is a column, so that maxima are taken over whole rows.
         self._grid = grid[compact_groups(grid, GROUP).T]
         self.templates = self._grid.flatten(0, 1)
         self._pixels = int(self._view.inside.sum())
@@ -79,8 +79,8 @@ class GreySearch(Proposer):
     def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
         """Propose the best orientations of disks (F, S, S) float32, at least `distinct_deg` apart, best first.
         The outline touches the borders. The score, 0 .. 1, is the share of the disk's deviation from smooth light that
-        the paint explains. A disk below `least` (None: `score_min`) has no proposal (`LOW_SCORE`).
-        Raises ShapeError (the disks are of another size).
+        the paint explains. A disk below `least` (None: `score_min`) has no proposal (`LOW_SCORE`). Raises ShapeError
+        (the disks are of another size).
         """
         check_disks(disks, self.size_px, self.size_px)
         found = ((some, *self.search(some)) for some in torch.split(disks, PRODUCT))
@@ -90,15 +90,15 @@ class GreySearch(Proposer):
         return Candidates.joined(list(rows))
 
     def rough(self, disks: Tensor) -> Candidates:
-        """Return the bank's peaks (F disks), best first; the score is 0: none is worked out."""
+        """Return the bank's peaks (F disks), best first; the score is 0, as it is not computed."""
         check_disks(disks, self.size_px, self.size_px)
-        R = self.templates[self._best(to_int8(self._normalise(disks)))]  # few disks: not filled up
+        R = self.templates[self._best(to_int8(self._normalise(disks)))]  # few disks: not padded
         peak = distinct(R, math.radians(self._settings.peak_deg))
         rows = (own[there][: self._settings.peaks].double() for own, there in zip(R, peak, strict=True))
         return Candidates.joined([Candidates.of_disk(own, own.new_zeros(len(own))) for own in rows])
 
     def likeness(self, disks: Tensor) -> Tensor:
-        """Return the correlation of disks (F, S, S) with the template most like each, (F,)."""
+        """Return the correlation of disks (F, S, S) with the most similar template of each, (F,)."""
         return self.score(disks).amax(-1)
 
     def search(self, disks: Tensor) -> tuple[Tensor, Tensor]:
@@ -136,12 +136,12 @@ class GreySearch(Proposer):
 def to_int8(even: Tensor) -> Tensor:
     """Quantise normalised pictures to -127 .. 127, (B, P) int8, padded to a multiple of 8 pixels."""
     scale = 127.0 / DEVIATIONS * math.sqrt(even.shape[1])
-    # One scale for all templates: as all have length 1, integer products rank them as they are.
+    # One scale for all templates: as all have length 1, integer products rank them correctly.
     return F.pad((even * scale).round().clamp(-127, 127), (0, -even.shape[1] % 8)).to(torch.int8)
 
 
 def compact_groups(R: Tensor, size: int) -> Tensor:
-    """Divide rotations (K, 3, 3) into groups of neighbours, (G, size) int64; some come twice unless size divides K.
+    """Divide rotations (K, 3, 3) into groups of neighbours, (G, size) int64; some are repeated unless size divides K.
     Source: halving along the matrix component that varies most (Bentley 1975).
     """
     flat = R.flatten(1)
@@ -161,7 +161,7 @@ def compact_groups(R: Tensor, size: int) -> Tensor:
 
 def best_of_groups(scores: Tensor, count: int) -> Tensor:
     """Return the best members of the `count` best groups, (F, count) int64, best first, from scores (F, M, G).
-    Indices are into the flattened members and groups; all groups where there are fewer.
+    Indices are into the flattened members and groups; all groups if there are fewer.
     """
     groups = scores.shape[2]
     group = scores.amax(1).topk(min(count, groups), dim=1).indices

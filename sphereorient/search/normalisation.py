@@ -1,4 +1,4 @@
-"""Disks cut out of frames, and pictures of them made comparable under any smooth light."""
+"""Disks cut out of frames, and their normalisation for any smooth light."""
 
 import cv2
 import numpy as np
@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sphereorient.sphere.view import disk_offsets
 
-RIM = 0.12  # of the radius: over this distance from the limb a pixel's share in averages grows from 0 to 1
+RIM = 0.12  # of the radius: distance from the limb over which a pixel's weight in averages grows from 0 to 1
 RIM_WEIGHT_MIN = 0.02  # of the outermost pixels in the comparison
 
 
@@ -19,7 +19,7 @@ def crop_disk(
     u_px, v_px: column and row of the disk's centre; radius_px becomes S / 2. Beyond the border, border pixels repeat.
     """
     offset = disk_offsets(size_px).numpy() * radius_px
-    # The window first: a map over the whole frame would convert all of it to float.
+    # Cut the window first, not to convert the whole frame to float.
     left, right = _span(u_px, radius_px, frame.shape[1])
     top, bottom = _span(v_px, radius_px, frame.shape[0])
     window = frame[top:bottom, left:right].astype(np.float32)
@@ -29,7 +29,7 @@ def crop_disk(
 
 
 def _span(centre_px: float, radius_px: float, length: int) -> tuple[int, int]:
-    """Return first and last + 1 of the columns or rows that hold a disk's pixels; at least the nearest one."""
+    """Return first and last + 1 of the columns or rows with a disk's pixels; at least the nearest one."""
     reach = int(np.ceil(radius_px)) + 2
     first = min(max(int(centre_px) - reach, 0), length - 1)
     return first, max(int(centre_px) + reach + 2, first + 1)
@@ -67,17 +67,17 @@ class LocalNormalisation:
         self._share = rim_share(size_px) / rim_share(size_px).sum()
         self._detail, self._window = Blur(size_px, detail), Blur(size_px, window)
         self._clip = clip
-        # Near the limb a small error of the outline is a large rotation: weigh pixels by foreshortening.
+        # Near the limb a small error of the outline is a large rotation: weight pixels by foreshortening.
         depth = (1 - radius.square()).clamp_min(0).sqrt().float()
         self._root_weight = (depth * rim_share(size_px).clamp_min(RIM_WEIGHT_MIN)).reshape(-1)[self._inside]
         self._unit = self._root_weight / self._root_weight.norm()
 
     def __call__(self, pictures: Tensor) -> Tensor:
-        """Return normalised pictures (B, S, S) as vectors (B, P) of length 1; a picture of one grey gives rounding."""
+        """Return normalised pictures (B, S, S) as vectors (B, P) of length 1; a uniform one gives rounding errors."""
         seen = self._detail(pictures)
         mean = (seen * self._share).sum((1, 2), keepdim=True)
         deviation = ((seen - mean).square() * self._share).sum((1, 2), keepdim=True).sqrt()
-        local = (seen - self._window(seen)) / deviation.clamp_min(1e-12)  # no unit from here on
+        local = (seen - self._window(seen)) / deviation.clamp_min(1e-12)  # dimensionless from here
         even = local.clamp(-self._clip, self._clip).flatten(1)[:, self._inside] * self._root_weight
         even = even - (even @ self._unit)[:, None] * self._unit
         return torch.nn.functional.normalize(even, dim=1)

@@ -13,10 +13,10 @@ from sphereorient.sphere import DiskView
 from sphereorient.sphere.texture_table import TextureTable
 from sphereorient.sphere.view import polynomials
 
-WHITE_ORDER, BLACK_ORDER = 2, 1  # of the light's polynomials over the disk: on the paint, and without it
-STEP_RAD = 0.14  # longest step that the paint's slope predicts
-RIDGE = 1e-4  # of the diagonal: keeps the light solvable where the disk shows one paint
-GAIN_MIN = 0.1  # white less black paint, deviations: darker pixels still have the right sign
+WHITE_ORDER, BLACK_ORDER = 2, 1  # of the light's polynomials over the disk: times the paint, and without it
+STEP_RAD = 0.14  # longest step for which the paint's slope holds
+RIDGE = 1e-4  # of the diagonal: keeps the light solvable for disks of one paint
+GAIN_MIN = 0.1  # least white minus black paint, deviations, to keep the right sign
 PIXEL = 0.5  # standard deviation of a pixel and its resampling, px
 
 
@@ -47,15 +47,15 @@ def detail_level(view: DiskView, paint: TextureTable, detail: float, every: int,
         paint=paint.blurred(math.hypot(detail, blur)),
         place=place,
         normal=normal,
-        weight=normal[2].square() * share,  # an error of the outline turns far near the limb
+        weight=normal[2].square() * share,  # an error of the outline is a large rotation near the limb
         white=terms,
         black=terms[: (BLACK_ORDER + 1) * (BLACK_ORDER + 2) // 2],
     )
 
 
 def refine_rotation(level: DetailLevel, disk: Tensor, R_view_body: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-    """Fit rough orientations R_view_body (Q, 3, 3) float32 of a disk (S, S) by Gauss-Newton steps; return scores (Q,),
-    too: the share of the disk's deviation from smooth light that paint explains, at most 1.
+    """Fit rough orientations R_view_body (Q, 3, 3) float32 of a disk (S, S) by Gauss-Newton steps; return also scores
+    (Q,): the share of the disk's deviation from smooth light that paint explains, at most 1.
     Source: variable projection, Golub and Pereyra 1973; robust weights, Geman and McClure 1987.
     """
     grey = level.blur(disk[None])[0].reshape(-1)[level.place]
@@ -85,13 +85,13 @@ def refine_rotation(level: DetailLevel, disk: Tensor, R_view_body: Tensor, steps
 
 
 def cayley(turn: Tensor) -> Tensor:
-    """Return rotations (Q, 3, 3) by Cayley's formula: as `so3.exp` but for terms of third order, much faster."""
+    """Return rotations (Q, 3, 3) by Cayley's formula, as `so3.exp` up to terms of third order, much faster."""
     H = so3.hat(turn)
     return torch.eye(3) + (H + 0.5 * H @ H) / (1.0 + 0.25 * turn.square().sum(-1))[:, None, None]
 
 
 def _cost(level: DetailLevel, residual: Tensor) -> Tensor:
-    """Sum over the pixels (..., P), bounded as the weights are: a reflection costs every orientation the same."""
+    """Sum over the pixels (..., P), bounded as the weights: a reflection costs the same for every orientation."""
     return (residual.square() * _trust(residual).sqrt() * level.weight).sum(-1)
 
 

@@ -1,4 +1,4 @@
-"""The paper's search: a coarse bank at half size, groups of possible orientations, a fine grid at real size."""
+"""The paper's search: a coarse bank at half size, groups of candidate orientations, a fine grid at full size."""
 
 import math
 
@@ -18,26 +18,26 @@ from sphereorient.sphere.texture_table import STEPS
 from sphereorient.sphere.view import disk_offsets
 
 BINS = 32  # of the histograms; finer ones are empty in the small moving region
-# Disks searched at once. Fixed, filled up with empty disks: the last bits of Otsu's sums depend on their number.
+# Disks searched at once; fixed, padded with empty disks, as the last bits of Otsu's sums depend on their number.
 LOOKED_UP = 4096  # templates of the fine grid at once
-SEMIFINALISTS = 8  # of the fine grid, the share 1 / 8 that matches every fourth pixel best is matched with all
-LEAST_KNOWN = 0.25  # of the pixels compared: an orientation that shows less known paint is none
-FINALISTS = 4  # best of the fine grid by the table; the renderer chooses among them
-REAL = Sampling(outside=0.5, supersampling=1)  # blurred as by usual optics; 0 outside, as the paint
-HALF = Sampling(outside=0.5, blur_px=0.0, supersampling=1)  # sharp: in blurred templates more orientations are possible
+SEMIFINALISTS = 8  # of the fine grid, the best eighth by every fourth pixel is compared with all pixels
+LEAST_KNOWN = 0.25  # of the compared pixels: an orientation with less known paint is not proposed
+FINALISTS = 4  # best of the fine grid by the table, among which the renderer chooses
+REAL = Sampling(outside=0.5, supersampling=1)  # with the blur of usual optics; 0 outside, like the paint
+HALF = Sampling(outside=0.5, blur_px=0.0, supersampling=1)  # sharp, as blurred templates allow more orientations
 
 
 def stretch_contrast(disks: Tensor, inside: Tensor, black_share: float, white_share: float) -> Tensor:
     """Stretch and clip disks (..., S, S) so that given shares (the paper's b and w) of `inside` (S, S) are 0 and 1.
-    The result is 0.5 outside the disk and in a disk of one grey. Where one grey prevents both shares, it spans 0 .. 1.
-    Source: paper section III B; docs/errata.md A2 for what the forced shares cost.
+    The result is 0.5 outside the disk and in a uniform disk. If one grey level prevents both shares, it spans 0 .. 1.
+    Source: paper section III B; docs/errata.md A2 for the cost of the forced shares.
     """
     values = disks[..., inside]
     ordered = values.sort(dim=-1).values
     count = ordered.shape[-1]
     low = ordered[..., min(int(black_share * count), count - 1), None]
     high = ordered[..., max(count - 1 - int(white_share * count), 0), None]
-    # More than all but the forced shares of one grey (dots on saturated white): stretch over what there is.
+    # One grey level fills more than the unforced share (dots on saturated white): stretch the available range.
     plateau = high <= low
     low, high = torch.where(plateau, ordered[..., :1], low), torch.where(plateau, ordered[..., -1:], high)
     flat = high <= low
@@ -49,7 +49,7 @@ def stretch_contrast(disks: Tensor, inside: Tensor, black_share: float, white_sh
 
 def otsu(histogram: Tensor) -> tuple[Tensor, Tensor]:
     """Return the threshold (...) of histograms (..., B) of 0 .. 1, and the difference of the classes' means, (...).
-    The threshold is the middle of a plateau; the difference is 0 where all values lie in one bin.
+    The threshold is the middle of a plateau; the difference is 0 if all values are in one bin.
     Source: Otsu 1979, eq. (18): the greatest variance between the classes.
     """
     bins = histogram.shape[-1]
@@ -63,7 +63,7 @@ def otsu(histogram: Tensor) -> tuple[Tensor, Tensor]:
     step = torch.where(mixed, (mean - sum_below) / safe_above - sum_below / safe_below, 0.0)
     between = below * above * step.square()
     best = between.amax(-1, keepdim=True)
-    # Empty bins between the classes make a plateau of equal variance; its middle is the fair threshold.
+    # Empty bins between the classes give a plateau of equal variance; its middle is the threshold.
     edge = torch.arange(1, bins, dtype=histogram.dtype, device=histogram.device) / bins
     plateau = (between >= best * (1 - 1e-4)).to(histogram.dtype)
     threshold = (plateau * edge).sum(-1) / plateau.sum(-1)
@@ -116,22 +116,21 @@ def _moving_threshold(one_hot: Tensor, fallback: Tensor, share: float, contrast_
 
 
 class TemplateBank(Proposer):
-    """Search all of SO(3) for the views of a texture map that look like a disk in black and white.
+    """Search all of SO(3) for the views of a texture map that resemble a disk in black and white.
     Source: paper sections III B and C; docs/errata.md A2 (T), E5 (grid), E7 (possible orientations).
 
     Args:
-        texture: (H, 2 H), the texture map, 0 black .. 1 white, NaN of no known paint: pixels that show it are not
-            compared, orientations that show it in most pixels not proposed; an `nn.Parameter` gets gradients through
-            `quality`.
+        texture: (H, 2 H), the texture map, 0 black .. 1 white; pixels with unknown paint (NaN) are not compared,
+            and orientations with mostly unknown paint not proposed; an `nn.Parameter` gets gradients through `quality`.
         size_px: side of the disks, rounded up to an even number; the templates of the coarse grid have half of it.
         settings: of the search; None: the defaults.
-        bank: that of another search with the same arguments; None: made now.
+        bank: of another search with the same arguments; None: computed now.
     `grid` (K, 3, 3) float32 are the rotations of the coarse grid, `bank` (K, P) their templates at half size.
     """
 
     grid: Tensor
     bank: Tensor
-    known_share: Tensor  # (K,), of the pixels compared: those that show known paint
+    known_share: Tensor  # (K,), share of the compared pixels with known paint
 
     def __init__(
         self,
@@ -159,7 +158,7 @@ class TemplateBank(Proposer):
             bank = _templates(half, self._half, self.grid)
         self.register_buffer("bank", bank.float(), persistent=False)
         self._known: SphereRenderer | None = None
-        if hidden is not None:  # templates are 0 there
+        if hidden is not None:  # templates are 0 at unknown paint
             self._known = SphereRenderer((~hidden).float(), size_px=size // 2, sampling=HALF)
             self.register_buffer("known_share", self._known_share(self.grid), persistent=False)
 
@@ -174,7 +173,7 @@ class TemplateBank(Proposer):
 
     def quality(self, paint: Tensor, R_view_body: Tensor) -> Tensor:
         """Return T (...) of paint (..., S, S) at orientations (..., 3, 3): the share of correct pixels; differentiable.
-        The renderer makes the pictures: T has gradients by the orientation, the paint and the renderer's texture.
+        As the renderer makes the pictures, T has gradients by orientation, paint and the renderer's texture.
         Source: the paper's T = 1/2 + sum of products / (2 pixels compared), docs/errata.md A2.
         """
         template = 2 * self.renderer(R_view_body) - 1
@@ -183,8 +182,8 @@ class TemplateBank(Proposer):
         return T if self._known is None else _of_known(T, self._known_share(R_view_body))
 
     def _known_share(self, R_view_body: Tensor) -> Tensor:
-        """Return the share of the pixels compared that show known paint, (...), at orientations (..., 3, 3)."""
-        assert self._known is not None  # who asks knows
+        """Return the share of compared pixels with known paint, (...), at orientations (..., 3, 3)."""
+        assert self._known is not None  # only called with unknown paint
         share: Tensor = self._known(R_view_body)[..., self._half].mean(-1)
         return share
 
@@ -197,8 +196,8 @@ class TemplateBank(Proposer):
 
     def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
         """Propose the best orientation of each group for disks (F, S, S) float32, whose outlines touch the borders.
-        A disk that fits nearly everywhere has no proposal (`RUNAWAY`), nor one below `least`, None: `score_min`
-        (`LOW_SCORE`).
+        A disk that fits nearly everywhere (`RUNAWAY`) or below `least` (None: `score_min`; `LOW_SCORE`) has no
+        proposal.
 
         Raises:
             ShapeError: the disks are of another size.
@@ -210,7 +209,7 @@ class TemplateBank(Proposer):
 
     def groups(self, T: Tensor) -> Tensor:
         """Return the group (F, K) int64 of each possible orientation by T (F, K), 0 about the best; -1: not possible.
-        The best orientation left opens a group and takes all that are nearer than `group_deg`.
+        The best remaining orientation starts a group and takes all nearer than `group_deg`.
         """
         highest = T.max(-1, keepdim=True)
         margin = self._settings.score_margin * (
@@ -219,7 +218,7 @@ class TemplateBank(Proposer):
         left = highest.values - margin < T
         group = torch.full_like(T, -1, dtype=torch.int64)
         flat, near = self.grid.flatten(1), 1 + 2 * math.cos(math.radians(self._settings.group_deg))
-        for number in range(self._settings.groups_max + 1):  # one group more than allowed is a runaway
+        for number in range(self._settings.groups_max + 1):  # one group more than allowed shows a runaway
             if not left.any():
                 break
             best = T.masked_fill(~left, -1).argmax(-1)
@@ -277,7 +276,7 @@ class TemplateBank(Proposer):
         return torch.cat(R), torch.cat(match), torch.arange(len(starts)).repeat_interleave(count)
 
     def _rendered(self, R_view_body: Tensor, pixels: Tensor) -> Tensor:
-        """Return templates (K, P) at the P pixels (S, S) bool of the real size, whole numbers, from a table int8."""
+        """Return templates (K, P) at the P pixels (S, S) bool of the full size, whole numbers, from a table int8."""
         if self._table is None:
             return _templates(self.renderer, pixels, R_view_body)
         return self._table.render(R_view_body, self._view.normal_view[pixels[self._view.inside]])
@@ -287,13 +286,13 @@ def _matches(template: Tensor, paint: Tensor) -> Tensor:
     """Return the sums of products (Q, A) of templates (Q, A, P) with their paint (Q, P), -1, 0 or 1."""
     if template.dtype is not torch.int8 or not template.is_cpu or not len(paint):
         return (template.float() @ paint[..., None])[..., 0]
-    # In whole numbers products with the paint of all starts take a third of the time.
+    # In whole numbers, products with the paint of all starts take a third of the time.
     every = torch._int_mm(template.flatten(0, 1), paint.to(torch.int8).T.contiguous())
     return every.float().reshape(*template.shape[:2], len(paint)).diagonal(dim1=0, dim2=2).T
 
 
 def _of_known(T: Tensor, share: Tensor) -> Tensor:
-    """Return T of a share of the pixels, (...), as likely by chance as the same T of all: of few pixels it is lower."""
+    """Return the T of all pixels that is as likely by chance as T of a share of them, (...): lower for few."""
     return torch.where(share < LEAST_KNOWN, 0.0, 0.5 + (T - 0.5) / share.clamp_min(LEAST_KNOWN).sqrt())
 
 
@@ -306,7 +305,7 @@ def best_of_each(group: Tensor, value: Tensor, count: int) -> Tensor:
 
 
 def _compared(size_px: int, disk_share: float) -> Tensor:
-    """Return which pixels are compared, (S, S) bool: those within a share of the radius."""
+    """Return the compared pixels, (S, S) bool: those within a share of the radius."""
     compared: Tensor = disk_offsets(size_px).norm(dim=-1) <= disk_share
     return compared
 

@@ -1,4 +1,4 @@
-"""The painted sphere: its map, the views of it, and the renderer."""
+"""The painted sphere: its map, its views, and the renderer."""
 
 from sphereorient.sphere.renderer import Sampling, SphereRenderer, see_sphere
 from sphereorient.sphere.texture import (

@@ -1,4 +1,4 @@
-"""Compare two texture maps of one sphere: body frame, displaced patches, changes."""
+"""Comparison of two texture maps of one sphere: body frame, displaced patches, changes."""
 
 import math
 from dataclasses import dataclass, replace
@@ -13,39 +13,39 @@ from sphereorient.sphere.texture import check_texture_shape, fibonacci_direction
 from sphereorient.sphere.texture_table import TextureTable, texture_table
 
 SEARCH_DEG = 10.0  # step of the grid of rotations
-SEARCH_BLUR_DEG = 7.0  # detail finer than the step only hides the right place
+SEARCH_BLUR_DEG = 7.0  # removes detail finer than the step
 SEARCH_PLACES, PLACES = 1200, 5000
 CHUNK = 256  # rotations tried at once
-PEAKS = 6  # best rotations that are refined
+PEAKS = 6  # refined rotations, the best ones
 BLURS_DEG = (5.0, 2.0, 0.8)  # of the refinement
 STEPS = 8  # of each refinement, of rotations and of patches
-KNOWN_USUAL = 0.1  # share of the sphere of which a correlation is half believed
-ALIKE_MIN = 0.55  # correlation below which two maps do not show one ball; of two balls, or mirrored: up to 0.5
-DIRECTIONS = 500  # in which the displacement is measured
-FINE_BLUR_DEG = 0.5  # of the finest tables: below a cell of theirs
+KNOWN_USUAL = 0.1  # known share of the sphere at which a correlation is halved
+ALIKE_MIN = 0.55  # least correlation of maps of one ball; of two balls, or mirrored: up to 0.5
+DIRECTIONS = 500  # number of directions in which the displacement is measured
+FINE_BLUR_DEG = 0.5  # of the finest tables: below one of their cells
 SIDE = 256  # of the tables: 0.7 degrees, tangent planes between
-HALF = 0.5  # share of a patch, or of a worn place, that a map must know
-RADIUS_DEG = 1.0  # within which the other map must show a grey level: displacement alone is no wear
-CHANGED = 0.15  # of black to white: a change that is reported
+HALF = 0.5  # least known share of a patch, or of a worn place
+RADIUS_DEG = 1.0  # search radius for a grey level in the other map: displacement is not wear
+CHANGED = 0.15  # of black to white: least reported change
 CHANGED_SHARE = 0.01  # of a patch
 REACHES = 16  # directions of that search
 PATCH_DEG = 7.5  # radius of a patch
 PATCH_REACH_DEG = 4.0  # of the search for it
-ROUGH_DEG, FINE_DEG = 1.0, 0.5  # steps of the search, and of the places of a patch
+ROUGH_DEG, FINE_DEG = 1.0, 0.5  # steps of the search, and of the samples of a patch
 CONTRAST_MIN = 0.15  # deviation of the texture in a patch, of black to white
-ONE_WAY = 0.15  # share of the weaker direction below which all edges run one way: no shift along them is measured
-NEIGHBOURS, FEWEST, NEAR_DEG = 6, 3, 20.0  # compared with, needed for a decision, largest distance
-ASTRAY_DEG = 1.0  # from the neighbours' median shift, beyond which a patch was found in the wrong place
-FOUND_MIN = 0.8  # correlation below which a patch was not found
+ONE_WAY = 0.15  # share of the weaker direction below which all edges are parallel: no shift along them is measured
+NEIGHBOURS, FEWEST, NEAR_DEG = 6, 3, 20.0  # number compared, least number, largest distance
+ASTRAY_DEG = 1.0  # from the neighbours' median shift, above which a patch was found in the wrong place
+FOUND_MIN = 0.8  # least correlation of a found patch
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapComparison:
-    """How two maps of one sphere differ; directions are in the reference's body frame."""
+    """Differences of two maps of one sphere; directions are in the reference's body frame."""
 
-    R_other_reference: Tensor  # (3, 3) float64: what the reference shows at d, the other shows at R d
-    correlation: float  # of both maps after that rotation, where both are known
-    direction_body: Tensor  # (D, 3) float64, where the displacement was measured
+    R_other_reference: Tensor  # (3, 3) float64: paint at d in the reference is at R d in the other
+    correlation: float  # of both maps after that rotation, where both have known paint
+    direction_body: Tensor  # (D, 3) float64, of the measured displacements
     moved_rad: Tensor  # (D, 2) float64, displacement to the east and north in the other map; NaN if unknown
 
     @property
@@ -79,7 +79,7 @@ def compare_maps(other: Tensor, reference: Tensor, turned: bool = True) -> MapCo
     blurs = (FINE_BLUR_DEG, *reversed(BLURS_DEG), SEARCH_BLUR_DEG)
     tables = {blur: [table.blurred(math.radians(blur)) for table in finest] for blur in blurs}
     shares, place = [share for _, share in maps], fibonacci_directions(PLACES)
-    rows = [min(len(share), SIDE) for share in shares]  # as many as the tables have: quick to look up
+    rows = [min(len(share), SIDE) for share in shares]  # as many as the tables have, for quick look-up
     coarse = [F.adaptive_avg_pool2d(share[None], (n, 2 * n))[0] for share, n in zip(shares, rows, strict=True)]
     R = _best_rotation(tables, coarse, place) if turned else torch.eye(3, dtype=torch.float64)
     correlation, known = _correlations(tables[BLURS_DEG[-1]], coarse, place, R[None])
@@ -94,7 +94,7 @@ def compare_maps(other: Tensor, reference: Tensor, turned: bool = True) -> MapCo
     seen = sample_texture(shares[1], spots.float()).amin(1) > HALF
     seen &= sample_texture(shares[0], (spots @ R.mT).float()).amin(1) > HALF
     moved = torch.where((sure & seen)[:, None], shift, torch.nan)
-    if turned:  # on grey levels alone a worn place would turn the whole map a little
+    if turned:  # with grey levels alone a worn place would rotate the whole map a little
         turn, moved = _common_turn(direction, moved)
         R = R @ so3.exp(turn)
     return MapComparison(R_other_reference=R, correlation=score, direction_body=direction, moved_rad=moved)
@@ -124,7 +124,7 @@ def fit_levels(texture: Tensor, reference: Tensor) -> tuple[float, float]:
 
 
 def _weighted_fit(columns: Tensor, weight: Tensor, values: Tensor) -> Tensor:
-    """Return the coefficients (K,) of columns (n, K) that fit values (n,) at weights (n,) best."""
+    """Return the coefficients (K,) of columns (n, K) of the weighted least-squares fit to values (n,)."""
     weighted = columns * weight[:, None]
     ridge = 1e-9 * torch.eye(columns.shape[1], dtype=columns.dtype)
     return torch.as_tensor(torch.linalg.solve(weighted.mT @ columns + ridge, weighted.mT @ values))
@@ -132,7 +132,7 @@ def _weighted_fit(columns: Tensor, weight: Tensor, values: Tensor) -> Tensor:
 
 def texture_change(new: Tensor, old: Tensor) -> Tensor:
     """Return the change of grey (H, 2 H), -1 darker .. 1, of a map from an old one in the same frame; NaN: unknown.
-    0: a displacement up to `RADIUS_DEG` explains it. The old grey levels are fitted to the new ones first.
+    0: explained by a displacement up to `RADIUS_DEG`. The old grey levels are fitted to the new ones first.
     """
     gain, offset = fit_levels(old, new)
     grey = old * gain + offset
@@ -152,7 +152,7 @@ def texture_change(new: Tensor, old: Tensor) -> Tensor:
 def without_changed(comparison: MapComparison, change: Tensor, most: float) -> MapComparison:
     """Return a comparison without displacements of patches whose texture changed by more than `most`."""
     spots = Patches(direction=comparison.direction_body, R_other_reference=comparison.R_other_reference).points(1.0)
-    changed = (change.abs() > most).double()  # an unknown texel has not changed
+    changed = (change.abs() > most).double()  # an unknown texel counts as unchanged
     spoilt = sample_texture(changed, spots).mean(1) > CHANGED_SHARE
     return replace(comparison, moved_rad=torch.where(spoilt[:, None], torch.nan, comparison.moved_rad))
 
@@ -180,12 +180,12 @@ def _best_rotation(tables: dict[float, list[TextureTable]], shares: list[Tensor]
 
 
 def _common_turn(direction: Tensor, moved: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rotation (3,), rad, that most displacements (D, 2) share, and the displacements without it."""
+    """Return the common rotation (3,), rad, of most displacements (D, 2), and the displacements without it."""
     east, north = compass(direction)
-    # turn x d to the east is turn . (d x east), and d x east is north; to the north it is -turn . east.
+    # turn x d has the east part turn . (d x east) = turn . north, and the north part -turn . east.
     columns = torch.stack([north, -east], dim=1)
     known, turn = torch.isfinite(moved).all(1), torch.zeros(3, dtype=torch.float64)
-    for _ in range(5 if known.any() else 0):  # of robust weights
+    for _ in range(5 if known.any() else 0):  # rounds of robust weights
         left = moved[known] - columns[known] @ turn
         length = left.norm(dim=-1)
         weight = 1 / (1 + (length / (2 * length.median().clamp_min(1e-6))) ** 2)
@@ -198,7 +198,7 @@ def _shrunk(score: Tensor, known: Tensor) -> Tensor:
 
 
 def _correlations(tables: list[TextureTable], shares: list[Tensor], place: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
-    """Return correlations of the other map, rotated by (M, 3, 3), with the reference, and known shares, (M,) each."""
+    """Return correlations of the reference with the other map, rotated by (M, 3, 3), and known shares, (M,) each."""
     there = R @ place.T
     a, _ = tables[0].sample(there.float())
     b, _ = tables[1].sample(place.T[None].float())
@@ -207,7 +207,7 @@ def _correlations(tables: list[TextureTable], shares: list[Tensor], place: Tenso
 
 
 def weighted_correlation(a: Tensor, b: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Return the correlations (M,) of values (M, P), weights (M, P) or None: equal; NaN without contrast."""
+    """Return the correlations (M,) of values (M, P), weights (M, P) or None (equal); NaN without contrast."""
     weight = torch.ones_like(a) if weight is None else weight
     total = weight.sum(1).clamp_min(1e-9)
     a, b = (x - ((weight * x).sum(1) / total)[:, None] for x in (a, b))
@@ -238,11 +238,11 @@ class Patches:
     R_other_reference: Tensor  # (3, 3)
 
     def points(self, step_deg: float) -> Tensor:
-        """Return the sample places of all patches, (D, P, 3), at a spacing in degrees."""
+        """Return the sample points of all patches, (D, P, 3), at a spacing in degrees."""
         return self.shifted(_offsets(step_deg), torch.zeros(len(self.direction), 2, dtype=torch.float64))
 
     def shifted(self, offset: Tensor, shift: Tensor) -> Tensor:
-        """Return places (D, P, 3) at offsets (P, 2), rad east and north, from patches shifted by (D, 2)."""
+        """Return points (D, P, 3) at offsets (P, 2), rad east and north, from patches shifted by (D, 2)."""
         d = self.direction[:, None]
         east, north = (axis[:, None] for axis in compass(self.direction))
         at = (offset + shift[:, None]).tan()
@@ -274,7 +274,7 @@ def patch_shifts(rough: list[TextureTable], fine: list[TextureTable], patches: P
     reference, _ = fine[1].sample(patches.points(FINE_DEG).mT.float())
     for _ in range(STEPS):
         grey, by_shift = _sampled(fine[0], patches, offset, shift)
-        # Unknowns: shift, gain and offset that take the other map's grey to the reference's.
+        # Unknowns: shift, gain and offset from the other map's grey to the reference's.
         columns = torch.stack([-by_shift[:, 0], -by_shift[:, 1], reference, torch.ones_like(reference)], dim=1).double()
         normal, right = columns @ columns.mT, columns @ grey.double()[..., None]
         step = torch.linalg.solve(normal + 1e-9 * torch.eye(4).double(), right)[:, :2, 0]
@@ -291,7 +291,7 @@ def patch_shifts(rough: list[TextureTable], fine: list[TextureTable], patches: P
 
 
 def _contradicted(direction: Tensor, shift: Tensor, sure: Tensor) -> Tensor:
-    """Return which patches (D,) contradict their overlapping neighbours: they match another edge."""
+    """Return which patches (D,) contradict their overlapping neighbours, as they match another edge."""
     east, north = compass(direction)
     moved = shift[:, :1] * east + shift[:, 1:] * north
     near = (direction @ direction.mT).fill_diagonal_(-1) * sure - (~sure).double()

@@ -15,16 +15,16 @@ from sphereorient.sphere.view import paint_seen, smooth_positive, sphere_normals
 
 RIM = 0.02  # rounding of the limb, radii^2: the least depth is 0.1 radii
 SHADE = 0.02  # rounding of a lamp's cosine: no kink in the light
-RIM_POINTS = 16  # rim points per sphere; between two of them the picture reaches 2 % further
-RIM_MARGIN = 1.04  # for these 2 %, and for the larger visible cap of a near camera (2 % at five radii)
-SAMPLES = 1 << 18  # rays computed at once: more leave the cache
+RIM_POINTS = 16  # rim points per sphere; between them the picture extends 2 % farther
+RIM_MARGIN = 1.04  # for these 2 %, and for the larger visible cap of a near sphere (2 % at five radii)
+SAMPLES = 1 << 18  # rays computed at once, to stay in the cache
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SphereSight:
-    """Paint and normals that rays see; made by `see_sphere`."""
+    """Paint and normals at rays."""
 
-    paint: Tensor  # (..., P), grey of the map; beyond the limb, of the nearest approach
+    paint: Tensor  # (..., P), grey of the map; beyond the limb, at the nearest approach
     normal: Tensor  # (..., P, 3), outward unit normals, frame of the rays
     depth2: Tensor  # (..., P), 1 - (distance of the ray from the centre, radii)^2: positive on a hit
 
@@ -32,9 +32,9 @@ class SphereSight:
 def see_sphere(
     rays: Rays, centre: Tensor, R: Tensor, texture: Tensor, radius: float | Tensor = 1.0, *, smooth: bool = False
 ) -> SphereSight:
-    """Return the paint that rays (..., P, 3) see on a map (H, 2 H).
-    `R` (..., 3, 3) takes body components to the rays' frame; `centre` (..., 3) and `radius`, () or (..., 1), have its
-    unit. `smooth` is twice differentiable (spline, rounded limb); otherwise bilinear and exact.
+    """Return the paint of a map (H, 2 H) at rays (..., P, 3).
+    `R` (..., 3, 3) takes body components to the rays' frame; `centre` (..., 3) and `radius`, () or (..., 1), are in its
+    unit. `smooth`: twice differentiable (spline, rounded limb); otherwise bilinear and exact.
     """
     check_tail("position_lab_mm", centre, 3)
     check_tail("R_lab_body", R, 3, 3)
@@ -67,11 +67,11 @@ class SphereRenderer(nn.Module):
     """Render a painted sphere, differentiable in orientation, position, radius and texture.
 
     Args:
-        texture: (H, 2 H), 0 black .. 1 white, NaN of no known paint: it is shown as grey; an `nn.Parameter` is
-            trained, anything else becomes a buffer.
+        texture: (H, 2 H), 0 black .. 1 white; NaN: unknown paint, shown as grey. An `nn.Parameter` is trained, anything
+            else becomes a buffer.
         radius_mm: sphere radius.
         camera: camera of the picture; None for the orthographic view along z (x right, y down).
-        size_px: side of the orthographic picture, which a sphere at the origin fills.
+        size_px: side of the orthographic picture, filled by a sphere at the origin.
         sampling: blur, background grey, rays per pixel.
 
     Raises:
@@ -120,13 +120,13 @@ class SphereRenderer(nn.Module):
         """
         R = tensor_of("R_lab_body", R_lab_body).to(self.texture.device)
         check_rotations("R_lab_body", R)
-        # mm differences at half a metre: single precision would move the picture.
+        # Single precision would move the picture: differences of mm at half a metre.
         exact = R.dtype if isinstance(self.camera, TelecentricCamera) else torch.float64
         position = torch.as_tensor((0.0,) * 3 if position_mm is None else position_mm).to(R.device, exact)
         check_tail("position_mm", position, 3)
         radius = torch.as_tensor(self.radius_mm if radius_mm is None else radius_mm).to(position)
         shape = np.broadcast_shapes(R.shape[:-2], position.shape[:-1], radius.shape)
-        if position.numel() == 3 and radius.numel() == 1:  # all in one place: their rays are computed once
+        if position.numel() == 3 and radius.numel() == 1:  # one position: the rays are computed once
             position, radius = position.reshape(1, 3), radius.reshape(1)
         else:
             position, radius = position.expand(*shape, 3).reshape(-1, 3), radius.expand(shape).reshape(-1)
@@ -142,7 +142,7 @@ class SphereRenderer(nn.Module):
         reach = float(reaches.max()) if len(reaches) else 1.0
         half = math.ceil(reach + 4 * sampling.blur_px) + 1
         size = 2 * half + 1
-        # Spheres may leave the picture: the canvas has room for a window beyond its edges.
+        # Spheres may leave the picture: the canvas is larger by a window.
         limit = torch.tensor([width, height], device=position.device)
         corner = (middle_px.detach().round().long() - half).clamp_min(-size).minimum(limit)
         fine_px = fine_pixels(size, samples).to(position)
@@ -157,7 +157,7 @@ class SphereRenderer(nn.Module):
         for k in torch.split(every, max(1, SAMPLES // len(fine_at))):
             at = k if len(position) > 1 else every[:1]
             rays = self.camera.rays(fine_at + corner[at, None])
-            # The limb is one sample wide: a step would have a noisy derivative.
+            # A limb one sample wide: the derivative of a step is noisy.
             beside = self.camera.rays(middle_px[at, None].detach() + position.new_tensor([1.0 / samples, 0.0]))
             to_centre = position[at, None] - beside.origin_lab_mm
             fine_mm = torch.linalg.cross(beside.direction_lab, to_centre).norm(dim=-1).detach()
@@ -228,7 +228,7 @@ def reach_px(camera: Camera, position_lab_mm: Tensor, radius_mm: Tensor | float)
         CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
     """
     rim, sight = rim_directions(camera, position_lab_mm, RIM_POINTS)
-    # The point nearest to the camera is not on the rim but must be in the liquid too.
+    # The point nearest to the camera, not on the rim, must be in the liquid too.
     offset_mm = torch.as_tensor(radius_mm)[..., None, None] * torch.cat(
         [RIM_MARGIN * rim, -sight[..., None, :]], dim=-2
     )
@@ -236,17 +236,17 @@ def reach_px(camera: Camera, position_lab_mm: Tensor, radius_mm: Tensor | float)
     reach: Tensor = (rim_px - camera.project(position_lab_mm)[..., None, :]).norm(dim=-1).amax(-1)
     if bool(reach.isnan().any()):
         do = "move it away from the camera or the wall"
-        raise CameraError(refusal("position_lab_mm", expected="a ball that is seen whole", got="another", do=do))
+        raise CameraError(refusal("position_lab_mm", expected="a wholly visible ball", got="another", do=do))
     return reach
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PaintedBall:
-    """Sphere with paint and light for `expected_grey`; one dtype, gradients allowed."""
+    """Sphere with paint and light for `expected_grey`; of one dtype, gradients allowed."""
 
     texture: Tensor  # (H, 2 H), 0 black paint .. 1 white paint
     radius_mm: float
-    edge_mm: float  # sigma of the optics' and the pixel's blur, at the sphere
+    edge_mm: float  # sigma of the blur by optics and pixel, at the sphere
     ambient: Tensor  # (), ambient light
     lamps_lab: Tensor  # (K, 3), towards each lamp; the length is its brightness (Lambert)
     black: Tensor  # (), grey level of black paint in light 1

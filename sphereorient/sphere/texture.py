@@ -12,10 +12,10 @@ from sphereorient.errors import ShapeError, TextureError, check_tail, refusal, t
 from sphereorient.files.picture import claimed_pixels, decoded_grey
 from sphereorient.files.whole_file import read_whole
 
-PICTURE_BYTES = 100_000_000  # of a picture file, which is read whole
+PICTURE_BYTES = 100_000_000  # of a picture file
 MOST_PIXELS = 2**25  # 8192 x 4096: enough for a disk of 2600 px
 SPLINE_TEXELS = 2  # reach of a cubic spline beyond the map's edges
-OVERSHOOT = 2.0  # a map that was learnt may exceed white a little; grey levels are far above
+OVERSHOOT = 2.0  # largest value of a map: learnt maps exceed white a little; grey levels are far above
 WHITE = {np.dtype(np.uint8): 255, np.dtype(np.uint16): 65535}  # grey level of white paint
 
 
@@ -58,7 +58,7 @@ def seen_path(texture: Path) -> Path:
 
 
 def read_seen(path: Path) -> Tensor | None:
-    """Read the counts beside a texture map, (H, 2 H); None without a file. A file of another form: TextureError."""
+    """Read the counts beside a texture map, (H, 2 H); None without a file. TextureError for another format."""
     if not path.is_file():
         return None
     do = "take the one that `sphereorient map` wrote, or move it away"
@@ -71,13 +71,13 @@ def read_seen(path: Path) -> Tensor | None:
 
 
 def load_unseen(texture: Path) -> Tensor | None:
-    """Return which texels (H, 2 H) of a map that `load_texture` read are no paint: of no picture (0 in the counts
+    """Return the texels (H, 2 H) of a map read by `load_texture` that are no paint: in no picture (0 in the counts
     beside it, see `seen_path`) or transparent. None: all are paint. Raise TextureError for counts of another size.
     """
     with Image.open(texture) as picture:
         size = picture.height, picture.width
         alpha = np.asarray(picture.getchannel("A")) if "A" in picture.getbands() else np.full(size, 255)
-    # Of 255: texels of less alpha are no paint.
+    # Texels with alpha below this (of 255) are no paint.
     unseen, counts = torch.from_numpy(alpha < 128), read_seen(seen_path(texture))
     if counts is not None and counts.shape != unseen.shape:
         expected, got = (f"{shape[1]} x {shape[0]}" for shape in (size, counts.shape))
@@ -99,7 +99,7 @@ def map_directions(height: int) -> Tensor:
 
 
 def unseen_share(unseen: Tensor) -> float:
-    """Return the share of the sphere that texels (H, 2 H) bool cover."""
+    """Return the share of the sphere covered by texels (H, 2 H) bool."""
     latitude = (torch.arange(len(unseen)) + 0.5) * (math.pi / len(unseen))
     return float((unseen.double().mean(1) * latitude.sin()).sum() / latitude.sin().sum())
 
@@ -117,9 +117,9 @@ def texture_coordinates(direction_body: Tensor) -> tuple[Tensor, Tensor]:
     """Return longitude -pi .. pi and latitude -pi/2 .. pi/2, rad, of directions (..., 3); finite gradients at poles."""
     check_tail("direction_body", direction_body, 3)
     x, y, z = direction_body.unbind(-1)
-    x, y = x.contiguous(), y.contiguous()  # on strides atan2 is slower, and another in the last digit
+    x, y = x.contiguous(), y.contiguous()  # strided atan2 is slower, and differs in the last digit
     if direction_body.requires_grad:
-        # At the poles the gradient of the longitude is infinite: replace x by a constant nudge and detach y.
+        # The gradient of the longitude is infinite at the poles: replace x by a constant nudge and detach y.
         nudge = torch.finfo(direction_body.dtype).eps
         polar = (x.abs() < nudge) & (y.abs() < nudge)
         x, y = torch.where(polar, x.detach() + nudge, x), torch.where(polar, y.detach(), y)
@@ -141,13 +141,13 @@ def closed_texture(texture: Tensor) -> Tensor:
 
 
 def sample_closed(closed: Tensor, direction_body: Tensor) -> Tensor:
-    """Return the grey of `sample_texture`, of a map that is sampled more than once."""
+    """Return the grey of `sample_texture` for a map sampled more than once."""
     return sample_at(closed[None], *texel_coordinates(direction_body, len(closed) - 2))[0]
 
 
 def sample_at(closed: Tensor, column: Tensor, row: Tensor) -> Tensor:
     """Return the grey (n, ...) of n closed maps (n, H + 2, 2 H + 2) at `texel_coordinates` (...)."""
-    from kornia.geometry.transform import remap  # late: half a second, and tables that are kept do without it
+    from kornia.geometry.transform import remap  # late: half a second, not needed with cached tables
 
     grey = remap(closed[None], (column + 1).reshape(1, 1, -1), (row + 1).reshape(1, 1, -1), align_corners=True)
     return grey.reshape(len(closed), *column.shape)
@@ -173,8 +173,8 @@ def sample_spline(texture: Tensor, direction_body: Tensor) -> Tensor:
 
 
 def known_paint(texture: Any) -> tuple[Tensor, Tensor | None]:
-    """Return a map (H, 2 H), 0 black .. 1 white, an array or a tensor, as a tensor, grey where it is NaN: no paint is
-    known there; and these texels, (H, 2 H) bool, None if there are none. Refuse other maps (ShapeError).
+    """Return a map (H, 2 H), 0 black .. 1 white, an array or a tensor, as a tensor, with unknown paint (NaN) as grey;
+    and the unknown texels, (H, 2 H) bool, None if there are none. Refuse other maps (ShapeError).
     """
     values = tensor_of("texture", texture)
     check_texture_shape(values)
@@ -242,7 +242,7 @@ def blobs(height: int, rng: torch.Generator) -> Tensor:
     """Draw smooth blobs, half of the sphere white."""
     wave = random_directions(60, rng) * (5 + 5 * torch.rand(60, 1, generator=rng, dtype=torch.float64))
     phase = 2 * math.pi * torch.rand(60, generator=rng, dtype=torch.float64)
-    rows = torch.split(map_directions(height), 2)  # all at once would fill 250 MB
+    rows = torch.split(map_directions(height), 2)  # all at once need 250 MB
     value = torch.cat([torch.cos(body @ wave.T + phase).sum(-1) for body in rows])
     return _edge(value - value.median(), 0.25)
 

@@ -1,4 +1,4 @@
-"""Tables of the texture map over directions: paint for banks, value and slope for fits."""
+"""Tables of the texture map by direction: paint for template banks, value and slope for fits."""
 
 import ctypes
 import math
@@ -31,10 +31,10 @@ THREE = ((-math.sqrt(3.0), 1 / 6), (0.0, 2 / 3), (math.sqrt(3.0), 1 / 6))
 SQUARE_25, SQUARE_9 = ([(a, b, p * q) for a, p in rule for b, q in rule] for rule in (FIVE, THREE))
 BASE_RAD = 0.008  # blur of the finest table: below half a pixel for disks up to 160 px
 CHUNK = 1 << 14  # directions per batch while a table is built
-STEPS = 127.0  # of a direction table: white paint; black is its negative
-AT_ONCE = 1 << 17  # pixels looked up at once: temporaries stay in the cache
+STEPS = 127.0  # white paint in a direction table; black is its negative
+AT_ONCE = 1 << 17  # pixels looked up at once, so that temporaries stay in the cache
 SIDE = 512  # cells per axis of the finest table: 0.4 degrees, 4 MB
-WIDER = 1.6  # most of a step of blur: the 9-point rule is exact if the map is smooth over the added width
+WIDER = 1.6  # largest ratio of blur in a step: the 9-point rule is exact for maps smooth over the added width
 CELLS_A_BLUR = 3.0  # least cells per blur sigma in coarser tables
 
 
@@ -72,7 +72,7 @@ def octahedral_cells(x: Tensor, y: Tensor, z: Tensor, side: int) -> Tensor:
 
 
 class DirectionTable(nn.Module):
-    """Paint of a map (H, 2 H) as the renderer sees it, in `cells`^3 cells of the unit cube (128: 1 degree, 2 MB).
+    """Paint of a map (H, 2 H) as in the renderer, in `cells`^3 cells of the unit cube (128: 1 degree, 2 MB).
     Ten times faster than `SphereRenderer`; pixels at patch borders differ: for candidates, not for refinement.
     """
 
@@ -104,7 +104,7 @@ class DirectionTable(nn.Module):
 class TextureTable:
     """Texture map blurred by a Gaussian on the sphere (sigma `blur_rad`), as tangent planes in cells of directions.
     `rows` (side^2, 4) float32 come from `texture_table`; the value's error is of second order in cell size over blur.
-    `unseen` is the table of the share of texels that are no paint, blurred alike; None: all are paint.
+    `unseen`: table of the share of texels without paint, equally blurred; None: all are paint.
     """
 
     def __init__(self, rows: Tensor, blur_rad: float, unseen: "TextureTable | None" = None) -> None:
@@ -127,7 +127,7 @@ class TextureTable:
         return TextureTable(self.rows.to(device), self.blur_rad, self.unseen and self.unseen.to(device))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return what `of` makes the same table from."""
+        """Return arrays from which `of` makes the same table."""
         own: dict[str, NDArray[Any]] = {"rows": self.rows.cpu().numpy(), "blur_rad": np.array(self.blur_rad)}
         unseen = {} if self.unseen is None else self.unseen.arrays()
         return own | {f"unseen_{name}": array for name, array in unseen.items()}
@@ -147,12 +147,12 @@ class TextureTable:
 
     @cached_property
     def _wider(self) -> "TextureTable":
-        """A step on the way to all that are blurred more."""
+        """An intermediate table for all wider blurs."""
         return self._widened(WIDER * self.blur_rad)
 
     def _widened(self, target: float) -> "TextureTable":
         added = math.sqrt(target**2 - self.blur_rad**2)
-        # A cell is 2.2 / side wide: a wider blur needs fewer cells.
+        # A cell is 2.2 / side wide: a wider blur allows fewer cells.
         side = min(self.side, 1 << math.ceil(math.log2(2.2 * CELLS_A_BLUR / target)))
 
         def rows(cells: Cells) -> Tensor:
@@ -175,7 +175,7 @@ def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE, unseen: Te
     """
     finest = min(blur_rad, BASE_RAD)
     hidden = None if unseen is None else texture_table(unseen.float(), finest, side)
-    closed = closed_texture(reduced_texture(texture.float(), 2.0 / finest))  # pixels as wide as the blur: no steps
+    closed = closed_texture(reduced_texture(texture.float(), 2.0 / finest))  # pixels as wide as the blur, against steps
 
     def rows(cells: Cells) -> Tensor:
         centre = cells[0]
@@ -190,7 +190,7 @@ def texture_table(texture: Tensor, blur_rad: float, side: int = SIDE, unseen: Te
 
 
 def _widened_by(code: ctypes.CDLL, rows: Tensor, width: float, cells: Cells) -> Tensor:
-    """Return what compiled code makes of a table's rows: those of some cells of one that is blurred more."""
+    """Return the rows of some cells of a more blurred table, by compiled code."""
     found, nodes = torch.empty(len(cells[0]), 4), torch.tensor(SQUARE_9, dtype=torch.float64)
     sizes = math.isqrt(len(rows)), len(found), len(nodes)
     parts = rows.float().contiguous(), *(part.contiguous() for part in cells), nodes

@@ -36,7 +36,7 @@ class DiskView:
 
 
 def paint_seen(texture: Tensor, normal_view: Tensor, R_view_body: Tensor, *, smooth: bool = False) -> Tensor:
-    """Return the paint (..., P) of a map (H, 2 H) at outward normals (..., P, 3); all pictures use this function.
+    """Return the paint (..., P) of a map (H, 2 H) at outward normals (..., P, 3), for all pictures.
     `R_view_body` (..., 3, 3) takes body components to the frame of the normals; `smooth`: spline, otherwise bilinear.
     """
     check_tail("R_view_body", R_view_body, 3, 3)
@@ -76,8 +76,8 @@ def sphere_normals(
     origin: Tensor, direction: Tensor, centre: Tensor, radius: float | Tensor, corner: float = 0.0
 ) -> tuple[Tensor, Tensor]:
     """Return unit normals (..., 3) where rays first meet a sphere, and 1 - (ray distance / radius)^2, (...).
-    A ray that misses gets the normal at its nearest approach. `origin`, `direction` and `centre` are (..., 3), `radius`
-    () or (...), in one frame and unit. `corner` (radii^2) above 0 rounds the limb: twice differentiable, normals within
+    A missing ray gets the normal at its nearest approach. `origin`, `direction` and `centre` are (..., 3), `radius` ()
+    or (...), in one frame and unit. `corner` (radii^2) above 0 rounds the limb: twice differentiable, normals within
     about sqrt(corner) of the limb are shifted inwards.
     """
     check_tail("direction", direction, 3)
@@ -89,7 +89,7 @@ def sphere_normals(
         depth = radius * smooth_positive(depth2 / radius**2, corner).sqrt()
     else:
         hit = depth2 > 0
-        # The root's gradient is infinite at the limb: a floor keeps it finite.
+        # A floor keeps the root's gradient finite at the limb.
         depth = torch.where(hit, depth2, 1.0).maximum(1e-12 * radius**2).sqrt()
         depth = torch.where(hit, depth, 0.0)
     normal = nearest - depth * direction
@@ -98,14 +98,14 @@ def sphere_normals(
 
 
 def nearest_approach(to_centre: Tensor, direction: Tensor, axis: int = -1) -> Tensor:
-    """Return the vectors from a sphere's centre to the nearest points of lines of sight; all have x, y, z along `axis`.
+    """Return the vectors from a sphere's centre to the nearest points of lines of sight; x, y, z are along `axis`.
     `to_centre` leads from a point of a line to the centre, `direction` is the line's unit direction.
     """
     return (to_centre * direction).sum(axis, keepdim=True) * direction - to_centre
 
 
 def fitted_circle(points: Floats, weight: Floats | None = None) -> tuple[float, float, float]:
-    """Return centre and radius of the circle that fits points (K, 2) best, by Kasa's linear least squares (1976)."""
+    """Return centre and radius of the best circle through points (K, 2), by Kasa's linear least squares (1976)."""
     root = np.ones(len(points)) if weight is None else np.sqrt(weight)
     columns = np.column_stack([2 * points, np.ones(len(points))])
     u, v, c = np.linalg.lstsq(columns * root[:, None], (points**2).sum(1) * root, rcond=None)[0].tolist()
@@ -120,7 +120,7 @@ def smooth_positive(x: Tensor, width: float) -> Tensor:
 
 
 def polynomials(across: Tensor, order: int) -> Tensor:
-    """Return all monomials of x and y up to an order, (..., K, P), from places (..., 2, P)."""
+    """Return all monomials of x and y up to an order, (..., K, P), at points (..., 2, P)."""
     x, y = across[..., 0, :], across[..., 1, :]
     columns = [torch.ones_like(x)]
     last = columns

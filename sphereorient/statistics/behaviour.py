@@ -15,30 +15,30 @@ from sphereorient.trajectory.walk import arcs, walk_of
 
 Mask = NDArray[np.bool_]
 ABOUT = ("x", "y", "z", "along the rotation")  # the gains
-PER_BLOCK = 10  # frames at least; a block is to be longer than errors are correlated
+PER_BLOCK = 10  # least frames; a block should be longer than the correlation of errors
 FEWEST_BLOCKS, GAIN_BLOCKS, DRIFT_BLOCKS = 8, 40, 30
 GAP = 1.5  # usual times between frames
-ONE_AXIS = 1e-3  # share of the turns' squares about the second axis, below which lab axes cannot be aligned
+ONE_AXIS = 1e-3  # share of the squared rotations about the second axis, below which lab axes cannot be aligned
 CORRELATIONS = np.append(np.linspace(0.0, 0.95, 20), [0.98, 0.995, 0.999])  # of neighbouring blocks
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Behaviour:
-    """Gain, drift and walk of a track against a reference; made by `behaviour_of`, read by score and report. NaN: not
-    known, for the `reason`. Axes: lab x, y, z; gains have a fourth entry, all axes together.
+    """Gain, drift and walk of a track against a reference. NaN: unknown, by `reason`. Axes: lab x, y, z; gains have a
+    fourth entry, all axes together.
     """
 
     frames: int  # with an orientation in both
-    pairs: int  # of neighbouring frames with one in both
+    pairs: int  # of neighbouring frames with an orientation in both
     gain: Interval  # (4,), 95 %
-    gain_bounds: Floats  # (2, 4), of a reference with errors: regression on it, and the inverse of its regression on us
+    gain_bounds: Floats  # (2, 4), for a reference with errors: regression on it, inverse of its regression
     gain_smooth: Interval | None  # (4,), of the smoothed orientations; None: there are none
     drift_deg_min: Floats  # (3,), degrees a minute
     drift_sigma_deg_min: Floats  # (3,), its standard error
-    apart_deg: float  # angle between the lab axes of the two, by the turns
-    heading_rad: float  # heading at the end less that of the reference; NaN, as the next two: the ball is not in place
+    apart_deg: float  # angle between the lab axes of the two, by the rotations
+    heading_rad: float  # heading at the end less the reference's; NaN, as the next two, if the ball moves
     length_ratio: float  # length of the path over that of the reference
-    end_share: float  # distance between the ends of the paths over the length of the reference's
+    end_share: float  # distance between the ends of the paths over the reference's length
     reason: str
 
     def columns(self) -> dict[str, Any]:
@@ -58,7 +58,7 @@ class Behaviour:
         }
 
     def numbers(self) -> dict[str, Any]:
-        """Return all as numbers, lists and texts, for JSON."""
+        """Return all values as numbers, lists and texts, for JSON."""
 
         def listed(of: Interval) -> dict[str, Any]:
             names = {"value": of.value, "low": of.low, "high": of.high, "sigma": of.error}
@@ -71,20 +71,20 @@ class Behaviour:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Reference:
-    """Orientations to compare a track of N frames with, at its times. NaN: none in this frame."""
+    """Orientations to compare a track of N frames with, at its times; NaN: none in this frame."""
 
     R_lab_body: Floats  # (N, 3, 3)
-    start: Mask | None = None  # (N,), frames in which another tracker began anew; None: it never did
-    exact: bool = True  # the truth; else another tracker's
+    start: Mask | None = None  # (N,), frames in which another tracker restarted; None: never
+    exact: bool = True  # the truth; else by another tracker
     held: bool = False  # whether its ball is known to stay in its place
 
 
 def behaviour_of(track: Trajectory, reference: Reference, align: bool = False) -> Behaviour:
-    """Compare the orientations of a track, measured and smoothed, with those of a reference. A constant rotation of the
-    body axes is removed, with `align` one of the lab axes too: the axes are those of an `exact` reference, else of the
-    track. A gain is the regression through zero of our turns on those of an exact reference, else the geometric mean of
-    the two regressions. A walk needs a fixed ball.
-    Raises ShapeError: not the same number of frames. Source: docs/accuracy.md, Behaviour.
+    """Compare the orientations of a track, measured and smoothed, with a reference's. A constant rotation of the body
+    axes is removed, with `align` also one of the lab axes: the axes are those of an `exact` reference, else of the
+    track. A gain is the regression through zero of the track's rotations on those of an exact reference, else the
+    geometric mean of the two regressions. A walk needs a fixed ball. Raises ShapeError: not the same number of frames.
+    Source: docs/accuracy.md, Behaviour.
     """
     frames, time_s = len(track), track.time
     begins = np.zeros(frames, bool) if reference.start is None else reference.start
@@ -138,12 +138,12 @@ def _turns(R: Floats) -> Floats:
 def _why_not(pairs: int, sure: bool) -> str:
     if pairs < FEWEST_BLOCKS * PER_BLOCK:
         return f"{pairs} pairs of neighbouring frames in both, at least {FEWEST_BLOCKS * PER_BLOCK} needed"
-    return "" if sure else "the ball turns about one axis only: the lab axes cannot be aligned"
+    return "" if sure else "the ball rotates about one axis only: the lab axes cannot be aligned"
 
 
 def _lab_axes(ours: Floats, theirs: Floats) -> tuple[Floats, float]:
-    """Return the rotation A that takes the reference's turns (P, 3) to ours with the least squares, and how large the
-    second axis' share of their squares is. Turns neither drift nor have body axes.
+    """Return the rotation A from the reference's rotations (P, 3) to the track's by least squares, and the share of the
+    second axis in their squares. Rotations have neither drift nor body axes.
     Source: Kabsch 1976, Acta Cryst. A32, 922.
     """
     U, size, Vt = np.linalg.svd(ours.T @ theirs)
@@ -152,8 +152,8 @@ def _lab_axes(ours: Floats, theirs: Floats) -> tuple[Floats, float]:
 
 
 def _gain(ours: Floats, theirs: Floats, of: Floats, exact: bool, reason: str) -> tuple[Interval, Floats]:
-    """Return the gains (4,) of turns `of` (P, 3), ours or smoothed, with intervals by blocks of them, and the two
-    regressions (2, 4) of ours. Smoothing changes the product with the reference alone, as errors of neither change it.
+    """Return the gains (4,) of rotations `of` (P, 3), the track's or smoothed, with intervals from blocks, and the two
+    regressions (2, 4) of the track's. Smoothing changes only the product with the reference.
     """
     if reason:
         unknown = np.full(4, np.nan)
@@ -175,7 +175,7 @@ def _gain(ours: Floats, theirs: Floats, of: Floats, exact: bool, reason: str) ->
 
 def _drift(time_s: Floats, R: Floats, R_reference: Floats, stretch: Rows, reason: str) -> tuple[Floats, Floats]:
     """Return the drift (3,) of orientations (K, 3, 3), degrees a minute, and its standard error. Errors are modelled as
-    d t + c + R b: the drift, and constants in the lab and in the body, of each `stretch` (K,) of the reference.
+    d t + c + R b: the drift, and constants in the lab and in the body, for each `stretch` (K,) of the reference.
     """
     if reason:
         return np.full(3, np.nan), np.full(3, np.nan)
@@ -183,7 +183,7 @@ def _drift(time_s: Floats, R: Floats, R_reference: Floats, stretch: Rows, reason
     error = _errors(R, R_reference, first, of)[..., None]
     along, lab = (time_s - time_s.mean())[:, None, None] / np.ptp(time_s), np.broadcast_to(np.eye(3), R.shape)
     both = np.concatenate([lab, R], axis=2)
-    # One frame's weight for b = 0: of a ball that does not turn, c and b are the same.
+    # b = 0 with the weight of one frame: for a ball that does not rotate, c and b are the same.
     square = segment_sums(both.mT @ both, of, len(first)) + np.diag([0.0] * 3 + [1.0] * 3)
 
     def constants(vectors: Floats) -> Floats:
@@ -195,21 +195,21 @@ def _drift(time_s: Floats, R: Floats, R_reference: Floats, stretch: Rows, reason
     inverse = np.linalg.inv(rest.sum(0))
     drift = inverse @ (along * (error - constants(error))).sum(0)
     slope, sigma = _slope(time_s, (error - constants(error - along * drift))[..., 0])
-    # A drift about an axis about which the ball turns little may be a constant in the body.
+    # If the ball rotates little about an axis, a drift about it may be a constant in the body.
     worse = np.sqrt(np.maximum(inverse.diagonal() * np.square(along).sum(), 1.0))
     return np.rad2deg(slope) * 60, np.rad2deg(sigma * worse) * 60
 
 
 def _errors(R: Floats, R_reference: Floats, first: Rows, of: Rows) -> Floats:
     """Return the rotation vectors (K, 3), rad, lab, from the reference (K, 3, 3), in the body axes of R by the first
-    frames of each stretch, to R; they grow on beyond a half turn. `first` (S,): where a stretch begins; `of` (K,).
+    frames of each stretch, to R; they may exceed half a turn. `first` (S,): where a stretch begins; `of` (K,).
     """
     early = np.arange(len(R)) - first[of] < PER_BLOCK
     U, _, Vt = np.linalg.svd(segment_sums((R_reference.mT @ R)[early], of[early], len(first)))
     U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
     E = R @ (R_reference @ (U @ Vt)[of]).mT
     error = rotation_vectors(E)
-    # Of the branches of a rotation vector the one nearest to the sum of the changes, which alone would gather noise.
+    # The branch of the rotation vector nearest to the sum of the changes, which itself accumulates noise.
     change = np.concatenate([error[:1], _turns(E)])
     change[first] = error[first]
     rough = np.cumsum(change, axis=0)
@@ -221,8 +221,8 @@ def _errors(R: Floats, R_reference: Floats, first: Rows, of: Rows) -> Floats:
 
 
 def _slope(time_s: Floats, error: Floats) -> tuple[Floats, Floats]:
-    """Return slope (3,) and standard error of errors (K, 3) over time, by least squares on the means of blocks whose
-    errors are correlated as rho^distance, rho by the restricted likelihood: independent blocks to nearly a random walk.
+    """Return slope (3,) and standard error of errors (K, 3) over time, by least squares on block means with errors
+    correlated as rho^distance, rho by the restricted likelihood: from independent blocks to nearly a random walk.
     Source: Patterson and Thompson 1971, Biometrika 58, 545.
     """
     blocks = min(len(time_s) // PER_BLOCK, DRIFT_BLOCKS)
@@ -244,9 +244,7 @@ def _slope(time_s: Floats, error: Floats) -> tuple[Floats, Floats]:
 
 
 def _walk(time_s: Floats, R: Floats, R_reference: Floats, use: Mask) -> tuple[float, float, float]:
-    """Return the headings' difference, rad, the paths' length ratio and end distance over length, summed over
-    stretches.
-    """
+    """Return difference of headings, rad, ratio of lengths, and end distance over length, summed over stretches."""
     masked = [np.where(use[:, None, None], one, np.nan) for one in (R, R_reference)]
     ours, theirs = (walk_of(time_s, one) for one in masked)
     turns = [arcs(one.turn_rad) for one in (ours, theirs)]

@@ -15,16 +15,16 @@ Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
 Statistic = Callable[[Floats], Floats]  # sums (..., K) over segments to values (..., Q)
 
-FEWEST = 2  # segments; one alone has no scatter
+FEWEST = 2  # segments; one has no scatter
 AT_ONCE = 4_000_000  # numbers of a block of weights
-ENOUGH = 20  # segments of the studentized bootstrap; with fewer the resampled errors are too rough
+ENOUGH = 20  # segments of the studentized bootstrap; fewer give rough resampled errors
 STEP = 0.01  # of a derivative by differences, relative to the root of the sum of squares over the segments
 RESAMPLES_AT_ONCE = 200  # bounds memory
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Interval:
-    """Values with their intervals, all of one shape; made by `bootstrap` and `studentized`."""
+    """Values with their intervals, all of one shape."""
 
     value: Floats
     low: Floats
@@ -52,14 +52,14 @@ def segment_sums(values: Floats, segment: Rows, segments: int) -> Floats:
 
 
 def segment_counts(place: Rows, bins: int, segment: Rows, segments: int) -> Rows:
-    """Return how many rows (M,) of each segment are in each of some bins, (S, bins)."""
+    """Return the number of rows (M,) of each segment in each of some bins, (S, bins)."""
     return np.bincount(segment * bins + place, minlength=segments * bins).reshape(segments, bins)
 
 
 def bootstrap(sums: Floats, statistic: Statistic, settings: BootstrapSettings | None = None) -> Interval:
     """Return a statistic of the total of `sums` (S, ...) over segments, with BCa intervals from resampled segments.
     `statistic` maps totals (..., *sums.shape[1:]) to values with the same leading shape; values are NaN where it is.
-    The intervals of a single segment are NaN; of none, the values too.
+    The intervals of a single segment are NaN; without segments, the values too.
     Source: Efron and Tibshirani 1993, An Introduction to the Bootstrap, chapter 14.
     """
     settings = settings or BootstrapSettings()
@@ -94,7 +94,7 @@ def _by_blocks(part: Callable[[Rows], Floats], count: int, size: int) -> Floats:
 
 
 def _weights(segments: int, rows: Rows, settings: BootstrapSettings) -> Floats:
-    """Return how often each segment is in the resamples with the numbers `rows` (B,), (B, segments)."""
+    """Return the number of times that each segment is in the resamples `rows` (B,), (B, segments)."""
     weights = np.empty((len(rows), segments))
     for place, row in enumerate(rows.tolist()):
         # One seed per resample: the block size does not change the numbers.
@@ -104,7 +104,7 @@ def _weights(segments: int, rows: Rows, settings: BootstrapSettings) -> Floats:
 
 
 def _quantiles(drawn: Floats, share: Floats) -> Floats:
-    """Return the quantile of each column at its own share; NaN where a drawn value is not finite."""
+    """Return the quantile of each column at its own share; NaN if a drawn value is not finite."""
     ordered = np.sort(drawn, axis=0)
     place = np.clip(share * (len(drawn) - 1), 0, len(drawn) - 1)
     left = np.floor(place).astype(np.int64)
@@ -160,13 +160,13 @@ def studentized(
 
 def _error(at: Statistic, totals: Floats, squares: Floats) -> Floats:
     """Return the error (..., G, Q) of a statistic, by its gradient; `squares` (..., G, K, K): products of the sums."""
-    squares = np.nan_to_num(squares)  # unknown sums of a group enter only statistics that are NaN
-    # Twice the totals give the same value: the gradient is orthogonal to them, contributions of segments have mean 0.
+    squares = np.nan_to_num(squares)  # NaN sums of a group enter only statistics that are NaN
+    # Scaled totals give the same value: the gradient is orthogonal to them, and segments contribute 0 on average.
     slopes = []
     with np.errstate(all="ignore"):
         for k in range(totals.shape[-1]):
             step = STEP * np.sqrt(squares[..., k, k])
-            step = np.where(step > 0, step, 1.0)  # no segment contributes: the slope is multiplied by 0 below
+            step = np.where(step > 0, step, 1.0)  # without contributions the slope is multiplied by 0 below
             moved = np.zeros_like(totals)
             moved[..., k] = step
             slopes.append((at(totals + moved) - at(totals - moved)) / (2 * step[..., None]))

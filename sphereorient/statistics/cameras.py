@@ -1,4 +1,4 @@
-"""Distance between the orientations of two cameras, each measured without the other."""
+"""Distance between the orientations by two cameras, each measured alone."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from sphereorient.trajectory.rotations import distance_rad
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraDistance:
-    """Distance between the orientations of two cameras; made by `camera_distances`, drawn by the report."""
+    """Distance between the orientations by two cameras."""
 
     cameras: tuple[str, str]
     distance_rad: Floats  # (K,), frames with both orientations

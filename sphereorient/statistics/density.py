@@ -17,7 +17,7 @@ NODES = 120  # values of a at which the likelihood is tabulated
 STEP = 1e-3  # of ln|x|, of its derivative
 FINE_BINS = 2000  # of ln|x|, for the likelihood: they round x by 0.5 %
 SMALLEST, LARGEST = 1e-4, 1e3  # limits of |x| in the likelihood
-REACH, BINS = 10.0, 61  # of the PDF to either side, standard deviations; odd: one bin is about 0
+REACH, BINS = 10.0, 61  # of the PDF to either side, standard deviations; odd, for a bin at 0
 
 
 def stretched_exponential(x: Floats, a: Floats | float) -> Floats:
@@ -52,7 +52,7 @@ def flatness_of(a: Floats | float) -> Floats:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StretchedFit:
-    """The stretched exponential of maximum likelihood; made by `fit_stretched`."""
+    """The stretched exponential of maximum likelihood."""
 
     a: Interval  # scalar
     flatness: Interval  # 9/5 exp(4 a^2)
@@ -61,7 +61,7 @@ class StretchedFit:
 
     @property
     def better_than_gaussian(self) -> bool:
-        """Whether its likelihood is above the Gaussian's."""
+        """Whether its likelihood exceeds the Gaussian's."""
         return self.log_likelihood > self.log_likelihood_gaussian
 
 
@@ -69,8 +69,8 @@ def fit_stretched(
     x: Floats, segment: Rows, segments: int, settings: BootstrapSettings | None = None, noise_share: float = 0.0
 ) -> StretchedFit:
     """Fit the stretched exponential to the motion in a component (M,), any unit, by maximum likelihood, with intervals.
-    The fit leaves out `noise_share` of the variance (`moments.noise_let_through`); such noise would fill the peak of
-    the density and lower a. `segment` (M,), 0 .. segments - 1, increases.
+    `noise_share` of the variance (`moments.noise_let_through`) is treated as noise, which would fill the peak of the
+    density and lower a. `segment` (M,), 0 .. segments - 1, increases.
     """
     normal = (x - x.mean()) / x.std()
     edges = np.linspace(np.log(SMALLEST), np.log(LARGEST), FINE_BINS + 1)
@@ -96,7 +96,7 @@ def _likeliest(log_x: Floats, noise_share: float) -> Statistic:
     nodes = np.linspace(NARROWEST_S, WIDEST_S, NODES)
     steps = (0.0, STEP, -STEP)
     table, up, down = (log_stretched_exponential(np.exp(log_x + s)[:, None], nodes, noise_share) for s in steps)
-    slope = (up - down) / (2 * STEP)  # a resampled ensemble is divided by its own standard deviation
+    slope = (up - down) / (2 * STEP)  # as a resampled ensemble is divided by its own standard deviation
 
     def fit(totals: Floats) -> Floats:
         counts, first, second = totals[..., :-2], totals[..., -2], totals[..., -1]
@@ -116,7 +116,7 @@ def _likeliest(log_x: Floats, noise_share: float) -> Statistic:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Density:
-    """PDF of one component in its standard deviations; made by `density`, drawn by the report."""
+    """PDF of one component in its standard deviations."""
 
     edges: Floats  # (B + 1,)
     pdf: Interval  # (B,)

@@ -15,7 +15,7 @@ from sphereorient.statistics.settings import BootstrapSettings
 
 @dataclass(frozen=True, kw_only=True)
 class FlowScales:
-    """Scales of the liquid in use, such as water-glycerol. Source: Kolmogorov 1941; docs/errata.md A5 (water)."""
+    """Scales of the liquid, such as water-glycerol. Source: Kolmogorov 1941; docs/errata.md A5 (water)."""
 
     viscosity_m2_s: float  # kinematic
     dissipation_w_kg: float  # energy dissipated per mass
@@ -33,7 +33,7 @@ class FlowScales:
 
 @dataclass(frozen=True, kw_only=True)
 class Surroundings:
-    """Properties of the sphere and its flow that are not in a track; None where unknown."""
+    """Properties of the sphere and its flow that are not in a track; None if unknown."""
 
     diameter_mm: float | None = None
     viscosity_m2_s: float | None = None
@@ -52,7 +52,7 @@ class Surroundings:
 
 @dataclass(frozen=True, kw_only=True)
 class DimensionlessNumber:
-    """One dimensionless number, in words and symbols; made by `dimensionless_numbers`."""
+    """One dimensionless number, in words and symbols."""
 
     name: str
     formula: str
@@ -60,8 +60,8 @@ class DimensionlessNumber:
 
 
 def dimensionless_numbers(table: Mapping[str, Moments], around: Surroundings) -> list[DimensionlessNumber]:
-    """Return the dimensionless numbers that the surroundings allow, from the moments by quantity.
-    Rms values are of one component; the sphere's are corrected for noise. Needs a diameter and a moving centre.
+    """Return the dimensionless numbers for the known surroundings, from the moments by quantity.
+    Rms values are of one component, the sphere's corrected for noise. Needs a diameter and a moving centre.
     Source: the paper, section IV: omega_rms against u_rms / D; docs/errata.md A5.
     """
     if around.diameter_mm is None or "velocity" not in table:
@@ -100,7 +100,7 @@ def _component_rms(moments: Moments) -> float:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lift:
-    """Correlation of omega x v with a, lab; made by `lift`. Columns: x, y, z, and the whole vectors (their sum)."""
+    """Correlation of omega x v with a, lab. Columns: x, y, z, and the whole vectors (their sum)."""
 
     about: ClassVar[str] = "a against omega x v"
     correlation: Interval  # (4,), cosine: <a . l> / sqrt(<a^2> <l^2>) with l = omega x v

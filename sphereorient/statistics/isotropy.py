@@ -1,4 +1,4 @@
-"""Tests of isotropy: of vectors in lab and body, and of orientations on SO(3); Euler angles; the frame of a vector."""
+"""Isotropy of vectors in lab and body, and of orientations on SO(3); Euler angles; the frame of a vector."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -13,7 +13,7 @@ from sphereorient.statistics.settings import BootstrapSettings
 from sphereorient.trajectory.rotations import tait_bryan
 
 ALIKE = 0.3  # largest residual of a row against the rotations, relative to the row
-DRAWS = 20_000  # of the null distribution; its 5 % point is then known to 0.2 %
+DRAWS = 20_000  # of the null distribution, for its 5 % point to 0.2 %
 AT_ONCE = 50_000  # rotations of a block
 BINS = 24  # of an Euler angle
 # Orthonormal symmetric traceless matrices; R acts on them as the five-dimensional representation
@@ -30,7 +30,7 @@ _TENSORS = np.array(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Isotropy:
-    """Result of the test of a quantity's isotropy; made by `isotropy`."""
+    """Result of the test of a quantity's isotropy."""
 
     quantity: str
     variance_share: Interval  # (3,), of x, y, z in the sum; 1/3 each if isotropic
@@ -40,7 +40,7 @@ class Isotropy:
 
 def isotropy(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | None = None) -> Isotropy:
     """Test whether the covariance of a quantity (a name in UNITS) is the same in all directions of its frame.
-    Samples are whole segments, since a track is correlated. With six segments or fewer the p-value is NaN.
+    Samples are whole segments, since frames of a track are correlated. NaN p-value for six segments or fewer.
     Source: Hotelling 1931; the paper, Table I, with docs/errata.md E6.
     """
     x = ensemble.values[quantity] - ensemble.values[quantity].mean(0)
@@ -81,9 +81,9 @@ def anisotropic_frame(lab: Isotropy, body: Isotropy, level: float = 0.05) -> Lit
 
 @dataclass(frozen=True, kw_only=True)
 class FrameOfRow:
-    """The frame of the components of an angular velocity; made by `frame_of_omega`."""
+    """The frame of the components of an angular velocity."""
 
-    lab_residual: float  # rms difference from the rotations' lab components over the row's rms
+    lab_residual: float  # rms difference from the lab components of the rotations over the row's rms
     body_residual: float
     frame: Literal["lab", "body", "none", "both"]
 
@@ -105,7 +105,7 @@ def frame_of_omega(ensemble: Ensemble, omega: Floats) -> FrameOfRow:
 
 @dataclass(frozen=True, kw_only=True)
 class Uniformity:
-    """Result of the test of uniform orientations; made by `uniformity`."""
+    """Result of the test of uniform orientations."""
 
     statistic: float
     p_value: float
@@ -158,7 +158,7 @@ def five_dimensional(R: Floats) -> Floats:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EulerDensity:
-    """PDF of one Euler angle; made by `euler_densities`, drawn by the report."""
+    """PDF of one Euler angle."""
 
     name: str  # theta_x, theta_y, theta_z
     edges_rad: Floats  # (B + 1,)

@@ -12,8 +12,8 @@ from sphereorient.statistics.segments import Ensemble
 from sphereorient.statistics.settings import BootstrapSettings
 
 LEAST_PAIRS = 0.02  # of the samples: longer lags have pairs in too few segments
-EVERY_LAG, MORE_LAGS = 40, 40  # the first lags, and how many sparser ones follow
-FEWEST_SEGMENTS = 10  # of a lag; with fewer its error bar means little
+EVERY_LAG, MORE_LAGS = 40, 40  # number of consecutive lags, and of sparser ones after them
+FEWEST_SEGMENTS = 10  # of a lag; fewer give no useful error bar
 
 
 def places(frame: Rows, segment: Rows) -> Rows:
@@ -43,7 +43,7 @@ class Pairs:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Correlation:
-    """Autocorrelation of one quantity; made by `correlation`. Columns: x, y, z, and the vector's (their sum)."""
+    """Autocorrelation of one quantity. Columns: x, y, z, and the vector's (their sum)."""
 
     quantity: str
     lag_s: Floats  # (L,), from 0
@@ -56,7 +56,7 @@ class Correlation:
 def correlation(ensemble: Ensemble, quantity: str, settings: BootstrapSettings | None = None) -> Correlation:
     """Return the autocorrelation of a quantity (a name in UNITS) about its ensemble mean, and its integral times.
     A value is the mean product of pairs over their mean square: unbiased by the lengths of segments. Pairs over a gap
-    count at their true lag. At the longest lag a fiftieth of the samples has a partner.
+    have their true lag. At the longest lag a fiftieth of the samples has a partner.
     Source: textbook; the paper's T_L is the integral time of `velocity`, up to the first zero.
     """
     pairs = Pairs(ensemble)
@@ -87,7 +87,7 @@ def _correlation_lags(pairs: Pairs, ensemble: Ensemble) -> Rows:
 
 
 def _curve_and_times(totals: Floats, lag_s: Floats) -> Floats:
-    """Return the curve and in a last row the integral times, (..., L + 1, 4), of sums (..., L, 3, 2)."""
+    """Return the curve and, as last row, the integral times, (..., L + 1, 4), of sums (..., L, 3, 2)."""
     whole = np.concatenate([totals, totals.sum(-2, keepdims=True)], axis=-2)
     curve = whole[..., 0] / whole[..., 1]
     return np.concatenate([curve, integral_time(curve, lag_s)[..., None, :]], axis=-2)
@@ -105,7 +105,7 @@ def integral_time(curve: Floats, lag_s: Floats) -> Floats:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Increments:
-    """Increments of omega_lab over a lag; made by `increments`. Columns: x, y, z, and all three pooled."""
+    """Increments of omega_lab over a lag. Columns: x, y, z, and all three pooled."""
 
     lag_s: Floats  # (L,)
     lag_frames: Rows  # (L,)
@@ -120,7 +120,7 @@ def increments(
     integral_time_s: float | None = None,
     settings: BootstrapSettings | None = None,
 ) -> Increments:
-    """Return rms and flatness of increments of omega_lab, for lags that ten segments or more reach.
+    """Return rms and flatness of increments of omega_lab, for lags within ten segments or more.
     `lags_s`, s, are rounded to frames; None: twelve, geometric, from one frame to `integral_time_s` (None: half the
     median segment). The flatness goes from the derivative's to 3 + (F - 3) / 2 at long lags.
     Source: the paper, section IV, with docs/errata.md E7.

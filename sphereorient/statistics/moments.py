@@ -1,4 +1,4 @@
-"""Table I: mean, rms, skewness and flatness of every quantity, with intervals and without the noise."""
+"""Table I: mean, rms, skewness and flatness of every quantity, with intervals and corrected for noise."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from sphereorient.trajectory.datasets import in_length
 COMPONENTS = ("x", "y", "z", "norm")
 STATISTICS = ("mean", "rms", "skewness", "flatness", "corrected_rms", "corrected_flatness", "noise_share")
 POSITIVE = np.array([False, True, False, True, True, True, True])
-LET_THROUGH = 0.65  # of the variance of a smoother's error is noise; measured by scripts/ensemble_coverage.py
-WARN_SHARE = 0.1  # of a variance; more noise gets a warning
+LET_THROUGH = 0.65  # share of noise in the variance of a smoother's error, by scripts/ensemble_coverage.py
+WARN_SHARE = 0.1  # share of noise in a variance that causes a warning
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Moments:
-    """Moments of one quantity; made by `moments`, read by the report. Four columns: x, y, z, norm."""
+    """Moments of one quantity. Four columns: x, y, z, norm."""
 
     quantity: str
     units: str
@@ -27,9 +27,9 @@ class Moments:
     rms: Interval  # about the mean
     skewness: Interval
     flatness: Interval
-    corrected_rms: Interval  # of the motion itself, by the track's own sigmas; NaN for the norm
+    corrected_rms: Interval  # of the motion alone, by the track's sigmas; NaN for the norm
     corrected_flatness: Interval
-    noise_share: Interval  # of the variance: noise, or motion that the smoother lost
+    noise_share: Interval  # of the variance: noise, or motion removed by the smoother
     samples: int
     segments: int
 
@@ -71,7 +71,7 @@ def _statistics(totals: Floats, sign: float) -> Floats:
     var = m2 - mean**2
     third = m3 - 3 * mean * m2 + 2 * mean**3
     fourth = m4 - 4 * mean * m3 + 6 * mean**2 * m2 - 3 * mean**4
-    mixed = x2s2 - mean**2 * s2  # the mean is small: it was subtracted before
+    mixed = x2s2 - mean**2 * s2  # the mean is small, as it was subtracted before
     true_var, true_fourth = without_noise(var, fourth, s2, s4, mixed, sign)
     share = s2 / np.where(sign > 0, var, true_var)
     return np.stack(
@@ -85,7 +85,7 @@ def without_noise(
 ) -> tuple[Floats, Floats]:
     """Return variance and fourth moment (...) of the motion from the measured ones.
     `s2`, `s4` and `mixed` (...) are the means of sigma^2, sigma^4 and (x - mean)^2 sigma^2. Sign 1 subtracts
-    independent normal noise; -1 adds the motion that a smoother removed, taken to be as intermittent as the rest.
+    independent normal noise; -1 adds motion removed by a smoother, assumed as intermittent as the rest.
     """
     part = 1.0 if sign > 0 else LET_THROUGH
     clean_var = var - part * s2
@@ -97,7 +97,7 @@ def without_noise(
 
 
 def noise_let_through(ensemble: Ensemble, quantity: str, component: int) -> float:
-    """Return the share of noise in a component's measured variance, 0 .. 0.9; 0 where the errors are unknown."""
+    """Return the share of noise in a component's measured variance, 0 .. 0.9; 0 if the errors are unknown."""
     var = float(ensemble.values[quantity][:, component].var())
     noise = float(np.square(ensemble.sigmas[quantity][:, component]).mean())
     if not (np.isfinite(noise) and var > 0):

@@ -1,4 +1,4 @@
-"""How much of a quantity is noise: by the track's sigmas, by increments over many lags, by the kernel's width."""
+"""Share of noise in a quantity: by the track's sigmas, by increments over many lags, by the kernel's width."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,25 +33,25 @@ def noise_warnings(table: dict[str, Moments], error: str) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MultiLag:
-    """Variance of a second or first derivative without noise; made by `multi_lag`. Three columns: x, y, z."""
+    """Variance of a second or first derivative without noise. Three columns: x, y, z."""
 
     quantity: str
     lag_s: Floats  # (L,)
-    naive: Floats  # (L, 3), variance of the difference quotient, noise and low-pass loss included
-    variance: Interval  # (3,), at zero lag and without noise
+    naive: Floats  # (L, 3), variance of the difference quotient, with noise and low-pass loss
+    variance: Interval  # (3,), at lag zero without noise
     noise_variance: Interval  # (3,), of the measured position (m^2) or orientation (rad^2)
 
     @property
     def rms(self) -> Floats:
-        """Rms of the motion itself, (3,)."""
+        """Rms of the motion alone, (3,)."""
         return np.sqrt(np.maximum(self.variance.value, 0.0))
 
 
 def multi_lag(tracks: Sequence[Trajectory], quantity: str, settings: BootstrapSettings | None = None) -> MultiLag:
     """Estimate the variance of "acceleration" or "alpha_lab" from the raw measurements, without their white noise.
     The second difference over n frames has variance (n dt)^4 <a^2> (1 - c n^2) + 6 times the noise variance; a linear
-    fit over some lags n separates them. For alpha it is the difference of R_{k+n} R_k^T and R_k R_{k-n}^T.
-    Raises TrackError (too few segments for the fit).
+    fit over some lags n separates them. For alpha it is the difference of R_{k+n} R_k^T and R_k R_{k-n}^T. Raises
+    TrackError (too few segments for the fit).
     Source: Machicoane, Lopez-Caballero, Bourgoin, Aliseda and Volk 2017, Meas. Sci. Technol. 28, 107002.
     """
     step_s = float(np.median(np.concatenate([np.diff(t.time) for t in tracks])))
@@ -110,7 +110,7 @@ def _extrapolated(square: Floats, lag_s: Floats) -> Floats:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WidthCurve:
-    """Rms and flatness by kernel width; made by `width_curve`, drawn by the report. Columns: x, y, z."""
+    """Rms and flatness by kernel width. Columns: x, y, z."""
 
     quantity: str
     width_s: Floats  # (W,), sigma of the Gaussian
@@ -129,8 +129,8 @@ def width_curve(
     settings: BootstrapSettings | None = None,
 ) -> WidthCurve:
     """Differentiate the measurements to velocity, acceleration or alpha_lab with Gaussian kernels (sigma, frames).
-    Narrow kernels let noise through, wide ones lose motion; a plateau between them is the rms. All widths use the
-    frames that the widest one reaches; NaN where all segments are shorter. White noise and regular times are assumed.
+    Narrow kernels pass noise, wide ones remove motion; a plateau between them is the rms. All widths use the frames
+    possible for the widest one; NaN if all segments are shorter. White noise and regular times are assumed.
     Source: Voth, La Porta, Crawford, Alexander and Bodenschatz 2002, J. Fluid Mech. 469, 121; the paper, section III.
     """
     sums = np.concatenate([_by_width(track, quantity, widths_frames) for track in tracks])
@@ -171,7 +171,7 @@ def _by_width(track: Trajectory, quantity: str, widths: Sequence[float]) -> Floa
     scale = _step(track) ** -(2 if quantity != "velocity" else 1)
     parts = []
     for width in widths:
-        kernel = gaussian_kernel(width, order).numpy()[::-1]  # as `np.convolve` reads it
+        kernel = gaussian_kernel(width, order).numpy()[::-1]  # reversed for `np.convolve`
         x2 = np.square(_convolved(values, kernel) * scale)
         s2 = _convolved(noise, np.square(np.convolve(kernel, CENTRAL) if rotating else kernel)) * scale**2
         parts.append(np.stack([np.ones_like(x2), x2, x2 * x2, s2, s2 * s2, x2 * s2], axis=-1))
@@ -182,7 +182,7 @@ def _by_width(track: Trajectory, quantity: str, widths: Sequence[float]) -> Floa
 
 
 def _grid(track: Trajectory) -> tuple[Rows, Rows, Rows]:
-    """Return rows, their places on a regular grid, and the segment of each place, -1: empty, between segments."""
+    """Return rows, their places on a regular grid, and the segment of each place; -1: empty, between segments."""
     rows = np.flatnonzero(track.segment >= 0)
     rows = rows[np.lexsort((track.time[rows], track.segment[rows]))]
     _, segment = np.unique(track.segment[rows], return_inverse=True)
@@ -195,7 +195,7 @@ def _grid(track: Trajectory) -> tuple[Rows, Rows, Rows]:
 
 
 def _convolved(x: Floats, kernel: Floats) -> Floats:
-    """Return each column's convolution, NaN where the kernel reaches an empty place, (K, 3)."""
+    """Return each column's convolution, (K, 3); NaN where the kernel reaches an empty place."""
     wider = np.pad(x, ((len(kernel) // 2,) * 2, (0, 0)), constant_values=np.nan)
     return np.stack([np.convolve(column, kernel, mode="valid") for column in wider.T], axis=1)
 
@@ -204,5 +204,5 @@ def _width_statistics(totals: Floats) -> Floats:
     """Return rms, flatness, both corrected, and the share of noise, (..., 3 W, 5), of sums (..., 3 W, 6)."""
     var, fourth, s2, s4, mixed = np.moveaxis(totals[..., 1:] / totals[..., :1], -1, 0)
     true_var, true_fourth = without_noise(var, fourth, s2, s4, mixed, 1.0)
-    true_flatness = np.where(s2 < var / 2, true_fourth / true_var**2, np.nan)  # else its errors are beyond any use
+    true_flatness = np.where(s2 < var / 2, true_fourth / true_var**2, np.nan)  # else its errors are too large
     return np.stack([np.sqrt(var), fourth / var**2, np.sqrt(true_var), true_flatness, s2 / var], axis=-1)

@@ -1,4 +1,4 @@
-"""The usable segments of one or many tracks, as flat arrays; how long segments last."""
+"""The usable segments of one or many tracks, as flat arrays, and their durations."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,18 +22,18 @@ COLUMNS |= {name: name for quantity in UNITS for name in (quantity, f"{quantity}
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ensemble:
-    """M samples in S segments; made by `ensemble_of`, read by all statistics. Rows are sorted by segment."""
+    """M samples in S segments. Rows are sorted by segment."""
 
     time_s: Floats  # (M,)
-    frame: Rows  # (M,), time in typical steps from the segment's first frame, rounded; a gap is a jump
+    frame: Rows  # (M,), rounded time in typical steps from the segment's first frame; a gap is a jump
     segment: Rows  # (M,), 0 .. S - 1, increasing
     track: Rows  # (S,), number of the track of a segment
-    span_s: Floats  # (S,), from a segment's first frame to its last, one step included
+    span_s: Floats  # (S,), from a segment's first frame to its last, plus one step
     step_s: float  # typical time between frames
     R_lab_body: Floats  # (M, 3, 3), smooth
-    values: Mapping[str, Floats]  # (M, 3) by name, UNITS; without TRANSLATION where the centre is fixed
-    sigmas: Mapping[str, Floats]  # (M, 3), standard deviations of the same; NaN where unknown
-    error: Literal["added", "removed"]  # sigma is noise that a kernel let through, or motion that a smoother removed
+    values: Mapping[str, Floats]  # (M, 3) by name, UNITS; without TRANSLATION for a fixed centre
+    sigmas: Mapping[str, Floats]  # (M, 3), standard deviations of the values; NaN if unknown
+    error: Literal["added", "removed"]  # sigma is noise passed by a kernel, or motion removed by a smoother
     length_unit: str = "mm"  # of the tracks
 
     def __len__(self) -> int:
@@ -50,7 +50,7 @@ class Ensemble:
         return np.searchsorted(self.segment, np.arange(self.segments + 1)).astype(np.int64)
 
     def at(self, kept: NDArray[np.bool_]) -> Self:
-        """Return the ensemble of the segments marked in `kept` (S,); TrackError if fewer than two are left."""
+        """Return the ensemble of the segments marked in `kept` (S,); TrackError if fewer than two remain."""
         _refuse_few(int(kept.sum()), "the segments kept")
         rows = kept[self.segment]
         parts = {name: getattr(self, name)[rows] for name in ("time_s", "frame", "R_lab_body")}
@@ -66,9 +66,9 @@ def ensemble_of(
     fewest: int = FEWEST,
 ) -> Ensemble:
     """Collect the usable segments of one or many tracks; `name` is for messages.
-    A frame is usable if all six quantities and the smooth pose are finite, and it was not extrapolated. A segment
-    counts if it has enough usable frames; frames with larger errors at its ends are then left out.
-    Raises TrackError (no usable frame, fewer than `fewest` segments, or tracks of kernels and smoothers together).
+    A frame is usable if all six quantities and the smooth pose are finite, and it was not extrapolated. A segment is
+    used if it has enough usable frames; frames with larger errors at its ends are left out. Raises TrackError (no
+    usable frame, fewer than `fewest` segments, or tracks of kernels and smoothers together).
     Source: the paper, section IV: segments above 0.25 T_L; docs/errata.md, settings of the paper: 50 frames.
     """
     settings = settings or SegmentSettings()
@@ -76,7 +76,7 @@ def ensemble_of(
     methods, units = ({getattr(track, key) for track in many} for key in ("method", "length_unit"))
     for kinds, of in ((methods if "paper" in methods else (), "method"), (units, "unit of length")):
         if len(kinds) > 1:
-            got, do = ", ".join(sorted(kinds)), "report each kind by itself"
+            got, do = ", ".join(sorted(kinds)), "report each kind separately"
             raise TrackError(refusal(name, expected=f"tracks of one {of}", got=got, do=do))
     pieces = [_usable(track, number, settings) for number, track in enumerate(many)]
     there = [len(piece["time_s"]) if fewest else track.valid.any() for piece, track in zip(pieces, many, strict=True)]
@@ -115,7 +115,7 @@ def ensemble_of(
 
 
 def _usable(track: Trajectory, number: int, settings: SegmentSettings) -> dict[str, NDArray[Any]]:
-    """Return `COLUMNS` of the usable frames, sorted; which have errors not larger than usual; the track's number."""
+    """Return `COLUMNS` of the usable frames, sorted; which have no unusually large errors; the track's number."""
     usable = (track.segment >= 0) & np.isfinite(track.orientation_smooth).all((1, 2)) & np.isfinite(track.time)
     for name in ("position_smooth", *UNITS):
         usable &= np.isfinite(getattr(track, name)).all(1)
@@ -128,7 +128,7 @@ def _usable(track: Trajectory, number: int, settings: SegmentSettings) -> dict[s
         size = np.linalg.norm(getattr(track, name)[rows], axis=1)
         known = size[np.isfinite(size)]
         if len(known):
-            sure &= ~(size > settings.max_sigma * np.median(known))  # unknown ones stay
+            sure &= ~(size > settings.max_sigma * np.median(known))  # keep unknown ones
     parts = {key: getattr(track, name)[rows] for key, name in COLUMNS.items()}
     return parts | {"sure": sure, "track": np.full(len(rows), number)}
 
@@ -155,11 +155,11 @@ def _refuse_few(count: int, name: str, which: str = "", fewest: int = FEWEST) ->
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Durations:
-    """Histogram of segment durations; made by `durations`, drawn by the report."""
+    """Histogram of segment durations."""
 
     edges_s: Floats  # (B + 1,)
     counts: Rows  # (B,)
-    truncated_s: float  # shorter ones do not count
+    truncated_s: float  # shorter ones are left out
     decay_time_s: Interval  # scalar; exponential law beyond the truncation
     segments: int
 

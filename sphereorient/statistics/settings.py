@@ -13,18 +13,18 @@ class SegmentSettings(BaseModel, frozen=True, extra="forbid"):
         None, gt=0, description="longer segments are cut into pieces of this duration, s: several integral times"
     )
     max_sigma: float = Field(
-        3.0, gt=1, description="frames whose error of acceleration or alpha is so many times the median are left out"
+        3.0, gt=1, description="frames are left out whose error of acceleration or alpha exceeds this many medians"
     )
-    keep_extrapolated: bool = Field(False, description="also use frames that the smoother filled from their neighbours")
+    keep_extrapolated: bool = Field(False, description="also use frames filled by the smoother")
 
 
 class BootstrapSettings(BaseModel, frozen=True, extra="forbid"):
-    """How the error bars are drawn: whole segments are resampled, since frames of one segment are not independent."""
+    """Error bars by resampling of whole segments, since frames of one segment are not independent."""
 
     resamples: int = Field(1000, ge=100, description="number of resampled ensembles")
-    level: float = Field(0.95, gt=0, lt=1, description="probability that an interval is to hold the true value")
+    level: float = Field(0.95, gt=0, lt=1, description="probability that an interval contains the true value")
     seed: int = Field(2011, ge=0, description="of the resampling; the same seed gives the same intervals")
 
 
 class StatisticsSettings(BootstrapSettings, SegmentSettings):
-    """Statistics of tracks: which segments count, and how the error bars are drawn."""
+    """Statistics of tracks: used segments, and error bars."""

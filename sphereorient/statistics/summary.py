@@ -1,5 +1,5 @@
-"""All statistics of the paper's section IV; a new one needs a field of `Distributions`, a call in `_distributions`.
-A record with `about` and `columns` has a table of the field's name in a report.
+"""All statistics of the paper's section IV; a new one needs a field of `Distributions` and a call in `_distributions`.
+A record with `about` and `columns` has a table with the field's name in a report.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -29,7 +29,7 @@ Advance = Callable[[int, int], None]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Distributions:
-    """The statistics that need two segments or more; a part of `Summary`."""
+    """The statistics of two segments or more; a part of `Summary`."""
 
     densities: Mapping[str, tuple[density.Density, ...]]  # by quantity: x, y, z
     increments: lags.Increments  # of omega_lab
@@ -40,16 +40,16 @@ class Distributions:
     uniformity: isotropy.Uniformity
     isotropies: Mapping[str, isotropy.Isotropy]  # by quantity
     rows: Mapping[str, isotropy.FrameOfRow]  # omega_lab, omega_body: the frame of their components
-    lift: Lift | None  # None where the centre is fixed
-    multi_lag: Mapping[str, noise.MultiLag]  # acceleration, alpha_lab; without those that cannot be fitted
+    lift: Lift | None  # None for a fixed centre
+    multi_lag: Mapping[str, noise.MultiLag]  # acceleration, alpha_lab, if fitted
     widths: Mapping[str, noise.WidthCurve]  # velocity, acceleration, alpha_lab
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Summary:
-    """All numbers of a report; made by `summarise`, read by figures, tables and the page."""
+    """All numbers of a report."""
 
-    settings: StatisticsSettings  # with the integral time that was used
+    settings: StatisticsSettings  # with the used integral time
     surroundings: Surroundings
     ensemble: Ensemble
     table: Mapping[str, Moments]  # Table I; without intervals for one segment
@@ -70,9 +70,9 @@ def summarise(
     progress: Advance = lambda done, total: None,
     name: str = "tracks",
 ) -> Summary:
-    """Compute all statistics of tracks, `name` in messages; an integral time that nobody gives is measured.
-    A single segment gives only the table, without intervals; without a segment that counts its numbers are NaN.
-    Raises TrackError (no valid frame, or tracks of kernels and of smoothers together).
+    """Compute all statistics of tracks, `name` in messages; an integral time is measured if not given.
+    A single segment gives only the table, without intervals; without a usable segment its numbers are NaN. Raises
+    TrackError (no valid frame, or tracks of kernels and of smoothers together).
     Source: the paper, section IV, with docs/errata.md A5, E6, E7.
     """
     many = [tracks] if isinstance(tracks, Trajectory) else list(tracks)
@@ -87,7 +87,7 @@ def summarise(
     if ensemble.segments >= FEWEST and settings.integral_time_s is None:
         first = lags.correlation(ensemble, next(iter(ensemble.values)), settings=settings)
         measured = float(first.integral_time_s.value[3])
-        if measured > 0:  # leave out segments that are short compared with the integral time of all of them
+        if measured > 0:  # leave out segments short against the integral time of all
             settings = settings.model_copy(update={"integral_time_s": measured})
             kept = ensemble.span_s >= settings.min_integral_times * measured
             ensemble = ensemble.at(kept) if kept.sum() >= FEWEST else ensemble
@@ -151,6 +151,6 @@ def _durations(tracks: Sequence[Trajectory], ensemble: Ensemble, settings: Stati
 def _multi_lag(tracks: Sequence[Trajectory], settings: StatisticsSettings) -> dict[str, noise.MultiLag]:
     found = {}
     for quantity in ("alpha_lab",) if all(track.held for track in tracks) else noise.RATES:
-        with suppress(TrackError):  # too few neighbouring frames: left out, and the page says so
+        with suppress(TrackError):  # too few neighbouring frames: left out, noted on the page
             found[quantity] = noise.multi_lag(tracks, quantity, settings)
     return found

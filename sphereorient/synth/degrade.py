@@ -1,4 +1,4 @@
-"""Degradations of picture batches, without kornia augmentations: these draw from torch's global generator."""
+"""Degradations of picture batches, without kornia's augmentations, which draw from torch's global generator."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -19,17 +19,17 @@ LOBES, LOBE_RADII = 2, 0.12  # highlights: number, and sigma in sphere radii
 BUBBLE_RADII = 0.12  # bubble radius in sphere radii
 SPECKS_PER_PX2 = 6e-4  # three on the paper's disk
 CLUTTER_PX = 6.0  # sigma of the background structure: about as coarse as the paint
-DARKEST = 1.0  # grey level of the least shot noise: the root has no finite slope at 0
+DARKEST = 1.0  # least grey level for shot noise, as the root has infinite slope at 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Disk:
-    """Place of the sphere in pictures (..., H, W)."""
+    """The sphere's disk in pictures (..., H, W)."""
 
     centre_px: Tensor  # (..., 2) as (u, v)
     radius_px: Tensor  # (...)
-    cover: Tensor | None = None  # (..., H, W), coverage of each pixel; None: of a round disk
-    behind: Tensor | None = None  # grey levels behind it, as the pictures; None: as bright as it
+    cover: Tensor | None = None  # (..., H, W), coverage of each pixel; None: a round disk
+    behind: Tensor | None = None  # grey levels behind it, like the pictures; None: as bright as the sphere
 
     def __post_init__(self) -> None:
         check_tail("centre_px", self.centre_px, 2)
@@ -43,11 +43,11 @@ class Disk:
         return right - centre[..., 0], down - centre[..., 1]
 
     def radius(self, pictures: Tensor) -> Tensor:
-        """Return the radius with pixel axes, (..., 1, 1), px."""
+        """Return the radius, px, (..., 1, 1), to broadcast over pixels."""
         return self.radius_px.to(pictures)[..., None, None]
 
     def within(self, window: tuple[slice, slice]) -> Self:
-        """Return it as seen in a part of the pictures: rows and columns."""
+        """Return the disk in a part of the pictures: rows and columns."""
         corner = self.centre_px.new_tensor([side.start for side in window[::-1]])
         return replace(self, centre_px=self.centre_px - corner)
 
@@ -79,7 +79,7 @@ def degrade(pictures: Tensor, disk: Disk, values: Mapping[str, float], rng: torc
 
 
 def uneven_light(pictures: Tensor, ratio: float, disk: Disk, rng: torch.Generator) -> Tensor:
-    """Dim the sphere across the disk, to 1 / ratio at one limb; not what is behind it."""
+    """Dim the sphere across the disk, to 1 / ratio at one limb, without the background."""
     angle = 2 * math.pi * _uniform(pictures, rng, 1)[..., 0, None, None]
     right, down = disk.offset(pictures)
     across = ((right * angle.cos() + down * angle.sin()) / disk.radius(pictures)).clamp(-1, 1)
@@ -127,7 +127,7 @@ def occlusion(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator) 
         return pictures
     angle = 2 * math.pi * _uniform(pictures, rng, 1)[..., 0, None, None]
     radius = disk.radius(pictures)
-    from scipy.optimize import bisect  # late, as kornia below: settings name these functions, tracking calls none
+    from scipy.optimize import bisect  # imported late, as kornia below: tracking does not need it
 
     away = bisect(lambda apart: _overlap(apart) - share, 0.0, 2.0, xtol=1e-15) * radius
     right, down = disk.offset(pictures)
@@ -158,7 +158,7 @@ def bubbles(pictures: Tensor, number: float, disk: Disk, rng: torch.Generator) -
 
 
 def _reached(near: Tensor) -> slice:
-    """Return the part of the last axis of (..., 1, N) bool that is true anywhere."""
+    """Return the part of the last axis of (..., 1, N) bool with any true value."""
     places = near.flatten(0, -2).any(0).nonzero()[:, 0].tolist()
     return slice(places[0], places[-1] + 1) if places else slice(0)
 
@@ -174,12 +174,12 @@ def dirt(pictures: Tensor, radius_px: float, disk: Disk, rng: torch.Generator) -
 
 
 def specks(pictures: Tensor, radius_px: float, rng: torch.Generator) -> Tensor:
-    """Draw which share of each pixel specks hide, (..., H, W)."""
+    """Return the share of each pixel hidden by drawn specks, (..., H, W)."""
     if radius_px == 0 or pictures.numel() == 0:
         return torch.zeros_like(pictures)
     height, width = pictures.shape[-2:]
     half = math.ceil(radius_px)
-    # Centres lie beyond the border too: specks reach in from there.
+    # Centres lie beyond the border too, as specks reach in from there.
     wider = pictures.new_empty((*pictures.shape[:-2], height + 2 * half, width + 2 * half))
     middles = (torch.rand(wider.shape, generator=rng, dtype=wider.dtype, device=rng.device) < SPECKS_PER_PX2).to(wider)
     at = torch.arange(-half, half + 1, dtype=pictures.dtype, device=pictures.device)
@@ -218,7 +218,7 @@ def saturation(pictures: Tensor, share: float, disk: Disk, rng: torch.Generator)
 
 
 def gain_to_clip(grey: Tensor, white: Tensor, share: float) -> Tensor:
-    """Return the gain (...), at least 1, that lifts a share of the white pixels above 255; both tensors (..., P)."""
+    """Return the gain (...), at least 1, that raises a share of the white pixels above 255; both tensors (..., P)."""
     count = white.sum(-1, keepdim=True)
     falling = grey.masked_fill(~white, -math.inf).sort(-1, descending=True).values
     limit = (share * count).round().long().minimum((count - 1).clamp_min(0))
@@ -241,13 +241,13 @@ def read_noise(pictures: Tensor, sigma: float, disk: Disk, rng: torch.Generator)
 _ALL = (uneven_light, highlights, background_clutter, occlusion, bubbles, dirt, contrast_loss, defocus, saturation)
 OPERATIONS: Mapping[str, Operation] = MappingProxyType({one.__name__: one for one in (*_ALL, shot_noise, read_noise)})
 
-# Those that draw a field of the whole picture: how it is drawn, and how it is put into a picture.
+# Degradations with a field of the whole picture: how it is drawn, and how it is applied.
 FIELDS: Mapping[str, tuple[Draw, Put]] = MappingProxyType(
     {"background_clutter": (clutter, add_behind), "dirt": (specks, darken)}
 )
 NOISE = ("shot_noise", "read_noise")  # of every pixel in every frame
-BEYOND = {"occlusion": 2.0, "bubbles": BUBBLE_RADII}  # how far these reach beyond the disk, radii
-ON_THE_BALL = ("uneven_light", "highlights")  # its own light, before the blur of the optics
+BEYOND = {"occlusion": 2.0, "bubbles": BUBBLE_RADII}  # reach beyond the disk, radii
+ON_THE_BALL = ("uneven_light", "highlights")  # change the ball's light, before the blur of the optics
 OF_ONE_BALL = (*ON_THE_BALL, "occlusion", "bubbles")  # lie on the disk of a ball
 
 
@@ -287,7 +287,7 @@ def blurred(pictures: Tensor, sigma_px: float) -> Tensor:
 
 
 def blur_reach(sigma_px: float) -> int:
-    """Return how far a pixel is spread by `blurred`, px."""
+    """Return the reach of `blurred`, px."""
     return math.ceil(4 * sigma_px)
 
 
@@ -300,7 +300,7 @@ def _round(right: Tensor, down: Tensor, radius_px: Tensor) -> Tensor:
 
 
 def _overlap(apart: float) -> float:
-    """Return the share of a circle that an equal one hides, whose centre is so many radii away."""
+    """Return the share of a circle hidden by an equal one at a distance of `apart` radii."""
     return (2 * math.acos(apart / 2) - apart * math.sqrt(1 - apart**2 / 4)) / math.pi
 
 

@@ -1,4 +1,4 @@
-"""What degradations change of a filmed scene: its settings, the map, the pictures, and the reported inputs."""
+"""Changes of a filmed scene by degradations: settings, map, pictures, and reported inputs."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -68,7 +68,7 @@ def with_motion_blur(base: SynthSettings, degrees_per_exposure: float) -> SynthS
     omega_rms = max(base.omega_rms, turn / exposure / math.sqrt(3)) if exposure > 0 else base.omega_rms
     turned_px = turn * base.diameter_px / 2
     moved_px = math.sqrt(3) * base.velocity_rms * 1000 * exposure * base.diameter_px / base.diameter_mm
-    # Half above the rms of both: most of the movie is sampled finely enough.
+    # Half more than the rms of both, so that most of the movie is sampled finely enough.
     samples = math.ceil(1.5 * math.hypot(turned_px, moved_px) / SMEAR_PX)
     samples = max(base.exposure_samples, samples)
     return _changed(base, exposure=exposure, omega_rms=omega_rms, exposure_samples=samples)
@@ -117,7 +117,7 @@ def random_patches(texture: Tensor, share: float, rng: torch.Generator) -> Tenso
 def through_optics(
     exposure: Exposure, disk: Disk, values: Mapping[str, float], rng: Callable[[str], torch.Generator]
 ) -> Exposure:
-    """Return an exposure with what `ON_THE_BALL` names of `values`, then blurred by the optics; `rng` is of a name."""
+    """Return an exposure with the degradations `ON_THE_BALL` in `values`, then blurred by the optics; `rng` by name."""
     ball = replace(disk.within(exposure.window), cover=torch.from_numpy(exposure.cover), behind=torch.zeros(()))
     light = torch.from_numpy(exposure.light)
     for name in ON_THE_BALL:
@@ -156,7 +156,7 @@ class Filming:
         return misdrawn(texture, self.values.get("texture_error", 0.0), rng)
 
     def picture(self, exposure: Exposure, disk: Disk, name: str, frame: int) -> NDArray[np.float32]:
-        """Return degraded grey levels (H, W) of a camera's frame, without camera noise; `disk`: place of the sphere."""
+        """Return degraded grey levels (H, W) of a camera's frame, without camera noise; `disk`: of the sphere."""
         exposure = self._lit_ball(exposure, disk, name)
         beyond = max((BEYOND.get(what, 0.0) for what in self.optics), default=0.0) * float(disk.radius_px)
         changed = exposure.within(math.ceil(beyond) + self._spread)
@@ -180,7 +180,7 @@ class Filming:
         return through_optics(exposure, disk, self.values, lambda what: self._generator(what, name))
 
     def _lit(self, part: Exposure, disk: Disk, name: str, frame: int | None, optics: Sequence[str]) -> Tensor:
-        """Return grey levels (h, w) of a part of a picture, before noise; frame None: as far as the movie shares it."""
+        """Return grey levels (h, w) of a part of a picture, before noise; frame None: the part common to the movie."""
         wider = part.within(self._spread)
         (rows, columns), height, width = wider.window, *part.light.shape
         cover = torch.from_numpy(wider.cover)
@@ -211,7 +211,7 @@ class Filming:
         return float(gain_to_clip(light.flatten(), inside.flatten(), self.values["saturation"]))
 
     def _generator(self, *what: str | int) -> torch.Generator:
-        # By name: another degradation does not change the random numbers of the rest.
+        # By name, so that a degradation does not change the random numbers of others.
         return seeded(self.settings.seed, *what)
 
 
@@ -224,9 +224,9 @@ def picture_of_ball(camera: Camera, position_lab_mm: Tensor, radius_mm: float) -
 
 
 def wrong_cameras(cameras: Mapping[str, Camera], values: Mapping[str, float], seed: int = 0) -> Mapping[str, Camera]:
-    """Return cameras whose principal points are off along the diagonal, in opposite directions by turns.
-    One is also rotated about the lab origin, whose pixel stays, and shifted along its own x: the second with an even
-    seed, the first with an odd one.
+    """Return cameras with principal points shifted along the diagonal, in alternating directions.
+    One camera (the second for an even seed, else the first) is also rotated about the lab origin, whose pixel stays,
+    and shifted along its own x.
     """
     off_px, degrees, shift_mm = (values.get(key, 0.0) for key in ("centre_error", "camera_rotation", "camera_shift"))
     if not (off_px or degrees or shift_mm):

@@ -25,17 +25,17 @@ LAMPS = 2
 READ_NOISE, SHOT_NOISE, BLUR_PX = 1.5, 0.3, 0.55  # always present, as in `SynthSettings`
 IN_PX = ("dirt", "defocus", "centre_error", "radius_error")  # values that scale with the picture
 OF_MAPS_AND_DISKS = {"ball_size", "motion_blur", "paint_wear", "centre_error", "radius_error", "texture_error"}
-# without those of movies and of two cameras
+# without degradations of movies and of two cameras
 DISK_DEGRADATIONS = tuple(name for name in DEGRADATIONS if name in OPERATIONS or name in OF_MAPS_AND_DISKS)
 
 
 class DiskSettings(BaseModel, frozen=True, extra="forbid"):
     """How single balls are filmed."""
 
-    size_px: int = Field(40, ge=16, le=128, description="side of the disks that come out, px")
-    diameter_px: float = Field(78.0, ge=16, description="of the ball where `ball_size` says nothing, px")
+    size_px: int = Field(40, ge=16, le=128, description="side of the resulting disks, px")
+    diameter_px: float = Field(78.0, ge=16, description="of the ball without `ball_size`, px")
     scale: float = Field(
-        1.0, gt=0.2, le=1, description="pictures are taken with pixels this much coarser: 0.5 is four times as fast"
+        1.0, gt=0.2, le=1, description="pictures have pixels coarser by this factor: 0.5 is four times as fast"
     )
     centre_sigma_px: float = Field(0.4, ge=0, description="usual error of an outline's centre, px")
     radius_sigma: float = Field(0.01, ge=0, description="usual error of its radius, share")
@@ -55,13 +55,13 @@ def film_disks(
         scale = max(scale, min(1.0, settings.size_px / diameter))  # coarse pictures keep their size
     radius = diameter * scale / 2
     count = len(R_view_body)
-    side = 2 * math.ceil(radius * (1 + 0.2)) + 2  # picture beyond the limb, radii
+    side = 2 * math.ceil(radius * (1 + 0.2)) + 2  # margin beyond the limb, radii
     middle = side / 2 - 0.5 + torch.rand((count, 2), generator=rng) - 0.5
     disk = Disk(centre_px=middle, radius_px=torch.full((count,), radius))
     grey, behind = _lit(texture, R_view_body.float(), values, disk, side, rng)
     within = {name: value * (scale if name in IN_PX else 1.0) for name, value in values.items() if name in OPERATIONS}
     before, lamps = replace(disk, behind=behind), {name: within.pop(name) for name in ON_THE_BALL if name in within}
-    grey = blurred(degrade(grey, before, lamps, rng), max(BLUR_PX * scale, 0.3))  # coarse pixels blur by themselves
+    grey = blurred(degrade(grey, before, lamps, rng), max(BLUR_PX * scale, 0.3))  # coarse pixels add blur
     grey = degrade(grey, before, within, rng)
     noise = (READ_NOISE**2 + SHOT_NOISE**2 * grey.clamp_min(0)).sqrt()
     grey = (grey + noise * torch.randn(grey.shape, generator=rng)).round().clamp(0, 255)

@@ -12,7 +12,7 @@ from sphereorient import so3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion6D:
-    """Exact motion at N instants, (N, ...); made by `RandomMotion.at`."""
+    """Exact motion at N instants, (N, ...)."""
 
     time_s: Tensor
     position_lab_mm: Tensor
@@ -48,7 +48,7 @@ def _random_waves(rms: float, correlation_time: float, rng: torch.Generator, cou
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RandomMotion:
-    """Smooth motion, known at any instant; made by `random_motion`."""
+    """Smooth motion, known at any instant."""
 
     path: _Waves  # velocity, mm/s; its integral is the position
     omega: _Waves  # omega_lab, rad/s
@@ -71,7 +71,7 @@ def random_motion(
     velocity_rms: float, velocity_time: float, omega_rms: float, omega_time: float, volume_mm: float, seed: int
 ) -> RandomMotion:
     """Draw a smooth motion from rms values per component, m/s and rad/s (lab), and correlation times, s.
-    The velocity is reduced where the rms distance from the origin would exceed half of `volume_mm`.
+    The velocity is reduced if the rms distance from the origin exceeds half of `volume_mm`.
     """
     rng = torch.Generator().manual_seed(seed)
     path = _random_waves(velocity_rms * 1000, velocity_time, rng)
@@ -83,7 +83,7 @@ def random_motion(
 
 
 def without_seam(motion: RandomMotion, period_s: float) -> RandomMotion:
-    """Return a motion that is the same after a period: whole waves of the path, whole turns about one axis."""
+    """Return a periodic motion: whole waves of the path, whole turns about one axis."""
     waves = (motion.path.rate * period_s / (2 * math.pi)).round().clamp_min(1.0)
     path = replace(motion.path, rate=waves * 2 * math.pi / period_s)
     omega = motion.omega.amplitude.square().sum(0).div(2).sqrt()  # rms of its components

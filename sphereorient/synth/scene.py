@@ -17,18 +17,18 @@ from sphereorient.sphere.texture import closed_texture
 from sphereorient.synth.settings import SynthSettings
 
 SUPERSAMPLING = 3  # rays per pixel and axis: edges are accurate to a few per cent
-AT_ONCE = 256  # frames whose places in the picture are computed at once
-POINTS = 41  # across a disk, of which some are hidden
-ROOM = 6  # rays are computed for windows that are wider by this part on each side: they serve some frames
+AT_ONCE = 256  # frames whose positions in the picture are computed at once
+POINTS = 41  # samples across a partly hidden disk
+ROOM = 6  # rays are computed for windows wider by this part on each side, to serve several frames
 
-# Lamp directions from the sphere (lab) and shares: two bright, one weak, so that no side is black.
+# Lamp directions from the sphere (lab) and shares: two bright lamps, and a weak one so that no side is black.
 LAMPS = ((-0.6, -0.5, 0.6, 0.55), (0.7, -0.3, 0.65, 0.35), (0.0, 0.9, -0.4, 0.1))
-LIT = 0.75  # share of the lamps that the brightest side receives
+LIT = 0.75  # share of the lamps' light on the brightest side
 
 TOWARDS, LAMP_SHARES = np.array(LAMPS, np.float32)[:, :3], np.array(LAMPS, np.float32)[:, 3] / np.float32(LIT)
 TOWARDS /= np.linalg.norm(TOWARDS, axis=1, keepdims=True)
 _ACROSS = fine_pixels(1, SUPERSAMPLING).numpy()
-# Weights of a pixel's middle and of a step to the right and down: those of its fine samples, row by row.
+# Weights of a pixel's middle and of steps to the right and down, for its fine samples, row by row.
 FINE = np.array([(1, right, down) for down in _ACROSS for right in _ACROSS], np.float32)
 
 Floats = NDArray[np.float64]
@@ -38,7 +38,7 @@ Window = tuple[slice, slice]  # rows and columns of a picture
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RenderedScene:
-    """Static part of the scene: texture map, light, grey levels; made by `make_scene`."""
+    """Static part of the scene: texture map, light, grey levels."""
 
     texture: Tensor  # (H, 2 H) float32, reduced to the picture's resolution
     closed: Tensor  # the same, continued over its edges, see `closed_texture`
@@ -53,41 +53,41 @@ def make_scene(texture: Tensor, settings: SynthSettings) -> RenderedScene:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Exposure:
-    """The part of a picture that balls change, before noise; made by `exposures`, before the blur of the optics."""
+    """The part of a picture that balls change, before noise and the blur of the optics."""
 
     size: tuple[int, int]  # height and width of the whole picture, px
     window: Window
     light: Singles  # (h, w), grey level of the balls times their coverage
     cover: Singles  # (h, w), their coverage
-    blur_px: float = 0.0  # of the optics, that light and cover do not have yet
+    blur_px: float = 0.0  # of the optics, not yet applied to light and cover
 
     @classmethod
     def none(cls, size: tuple[int, int]) -> Self:
-        """Return that of a picture (H, W) without a ball."""
+        """Return the exposure of a picture (H, W) without a ball."""
         nothing = np.zeros((0, 0), np.float32)
         return cls(size=size, window=(slice(0, 0), slice(0, 0)), light=nothing, cover=nothing)
 
     def before(self, behind: Singles | float) -> Singles:
-        """Return the picture (H, W) of the balls before grey levels (H, W), or one level."""
+        """Return the picture (H, W) of the balls in front of grey levels (H, W), or of one level."""
         picture = np.broadcast_to(np.asarray(behind, np.float32), self.size).copy()
         self.put(picture)
         return picture
 
     def put(self, picture: Singles) -> None:
-        """Put the balls before the grey levels of a picture (H, W), in place."""
+        """Put the balls in front of the grey levels of a picture (H, W), in place."""
         seen = self.through_optics()
         picture[self.window] *= 1 - seen.cover
         picture[self.window] += seen.light
 
     def through_optics(self) -> Self:
-        """Return it as the optics blur it."""
+        """Return the exposure blurred by the optics."""
         if not self.blur_px:
             return self
         light, cover = (cv2.GaussianBlur(one, (0, 0), self.blur_px) for one in (self.light, self.cover))
         return replace(self, light=np.asarray(light, np.float32), cover=np.asarray(cover, np.float32), blur_px=0.0)
 
     def within(self, margin_px: int) -> Self:
-        """Return it with a window that is wider on all sides, as far as the picture reaches."""
+        """Return the exposure with a window wider on all sides, within the picture."""
         window = _wider(self.window, margin_px, self.size)
         light, cover = wider = np.zeros((2, *(side.stop - side.start for side in window)), np.float32)
         wider[(..., *_inside(self.window, window))] = self.light, self.cover
@@ -111,7 +111,7 @@ class PixelRays:
 
     @classmethod
     def of(cls, camera: Camera, window: Window) -> Self:
-        """Compute the rays of a window; those of a pixel do not depend on it."""
+        """Compute the rays of a window; the rays of a pixel do not depend on the window."""
         wider = _wider(window, 1, camera.image_size[::-1])
         v, u = torch.meshgrid(*(torch.arange(side.start, side.stop).double() for side in wider), indexing="ij")
         rays = camera.rays(torch.stack([u, v], -1))
@@ -120,12 +120,12 @@ class PixelRays:
         return cls(window=wider, exact=exact, linear=linear).within(window)
 
     def within(self, window: Window) -> Self:
-        """Return those of a part of the window."""
+        """Return the rays of a part of the window."""
         part = (..., *_inside(window, self.window))
         return replace(self, window=window, exact=self.exact[part], linear=self.linear[part])
 
     def feet(self, centre: Floats) -> Singles:
-        """Return where the fine samples pass a centre (3,) nearest, seen from it, (3, S, h, w)."""
+        """Return where the fine samples pass a centre (3,) nearest, relative to it, (3, S, h, w)."""
         start, direction = self.exact[0] - centre[:, None, None], self.exact[1]
         ahead = (start * direction).sum(0)
         foot = (start - ahead * direction).astype(np.float32)
@@ -139,7 +139,7 @@ class PixelRays:
 
 
 def _fine(linear: Singles) -> Singles:
-    """Return what fine samples have, (3, S, h, w), of values and their changes to the right and down (3, 3, h, w)."""
+    """Return fine samples (3, S, h, w) from values and their changes to the right and down (3, 3, h, w)."""
     found: Singles = (FINE @ linear.swapaxes(0, 1).reshape(3, 3, -1)).reshape(3, len(FINE), *linear.shape[2:])
     return found
 
@@ -160,10 +160,9 @@ def expose(scenes: Sequence[RenderedScene], camera: Camera, position_lab_mm: Ten
 def exposures(
     scenes: Sequence[RenderedScene], camera: Camera, position_lab_mm: Tensor, R_lab_body: Tensor
 ) -> Iterator[Exposure]:
-    """Yield N exposures of K balls without noise.
-    `position_lab_mm` (K, N, E, 3) and `R_lab_body` (K, N, E, 3, 3) are the poses at the E instants of each exposure.
-    Nearer balls cover those behind them; balls cast no shadows.
-    Raises CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
+    """Yield N exposures of K balls without noise. `position_lab_mm` (K, N, E, 3) and `R_lab_body` (K, N, E, 3, 3) are
+    the poses at the E instants of each exposure. Nearer balls cover those behind them; balls cast no shadows. Raises
+    CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
     """
     size, blur_px = camera.image_size[::-1], scenes[0].settings.blur_px
     radii_mm = position_lab_mm.new_tensor([scene.settings.diameter_mm / 2 for scene in scenes])[:, None, None]
@@ -172,7 +171,7 @@ def exposures(
     for X, R in zip(*parts, strict=True):
         disks = torch.cat([camera.project(X), reach_px(camera, X, radii_mm)[..., None]], -1).numpy()
         away = (X - centre_lab_mm(camera)).norm(dim=-1).sum(-1)
-        order = away.argsort(0, descending=True).T.tolist()  # far ones first
+        order = away.argsort(0, descending=True).T.tolist()  # far balls first
         centres, turns = X.double().numpy(), R.mT.float().numpy()
         for n in range(X.shape[1]):
             balls = []
@@ -188,7 +187,7 @@ def exposures(
 
 
 def _exposure(balls: Sequence[tuple[Window, Singles]], blur_px: float, size: tuple[int, int]) -> Exposure:
-    """Put balls before each other, far ones first: windows and what is seen there, (E, 2, h, w)."""
+    """Combine balls, far ones first: windows and their light and coverage, (E, 2, h, w)."""
     if not balls:
         return Exposure.none(size)
     window = _wider(_around([place for place, _ in balls]), 2 + round(4 * blur_px), size)
@@ -214,7 +213,7 @@ def _inside(part: Window, window: Window) -> Window:
 
 
 def _window(disks: NDArray[np.float64], size: tuple[int, int]) -> Window:
-    """Return the part of a picture (H, W) that disks (E, 3) reach: u, v, radius, px."""
+    """Return the part of a picture (H, W) that contains disks (E, 3): u, v, radius, px."""
     low, high = (disks[:, 1::-1] - disks[:, 2:]).min(0), (disks[:, 1::-1] + disks[:, 2:]).max(0)
     starts, stops = np.floor(low).astype(int), np.ceil(high).astype(int) + 1
     down, right = (slice(int(a), int(b)) for a, b in zip(starts.clip(0, size), stops.clip(0, size), strict=True))
@@ -230,7 +229,7 @@ def _wider(window: Window, margin_px: int, size: tuple[int, int]) -> Window:
 
 
 def _seen(scene: RenderedScene, rays: PixelRays, centre: Floats, R_body_lab: Singles) -> Singles:
-    """Return shaded paint times coverage, and coverage, (2, h, w), of a ball: as `see_sphere`, where a ray hits."""
+    """Return shaded paint times coverage, and coverage, (2, h, w), of a ball, as `see_sphere` where a ray hits."""
     settings, radius_mm = scene.settings, scene.settings.diameter_mm / 2
     normal = rays.feet(centre)
     depth2 = np.float32(radius_mm**2) - np.einsum("kshw,kshw->shw", normal, normal)
@@ -247,7 +246,7 @@ def _seen(scene: RenderedScene, rays: PixelRays, centre: Floats, R_body_lab: Sin
 
 
 def _paint(closed: Tensor, body: Singles) -> Singles:
-    """Return the paint of `sample_closed` (P,) at directions (3, P), in a third of the time."""
+    """Return the paint by `sample_closed` (P,) at directions (3, P), in a third of the time."""
     height, (x, y, z) = len(closed) - 2, body
     place = torch.empty(2, len(x))
     torch.atan2(*map(torch.from_numpy, (y, x)), out=place[0])
@@ -261,14 +260,14 @@ def _paint(closed: Tensor, body: Singles) -> Singles:
 def digitise(picture: Singles, settings: SynthSettings, rng: torch.Generator) -> NDArray[np.uint8]:
     """Add camera noise to grey levels (H, W) and round to 8 bits."""
     noise = torch.empty(picture.shape).normal_(generator=rng).numpy()
-    sigma = torch.from_numpy(picture).clamp_min(0).numpy()  # with numpy this and the root take three times as long
+    sigma = torch.from_numpy(picture).clamp_min(0).numpy()  # numpy takes three times as long for this and the root
     sigma *= settings.shot_noise**2
     sigma += settings.read_noise**2
     return np.asarray(cv2.add(picture, cv2.multiply(cv2.sqrt(sigma, sigma), noise, noise), dtype=cv2.CV_8U))
 
 
 def seeded(*what: str | int) -> torch.Generator:
-    """Return a generator of random numbers that these words and numbers decide."""
+    """Return a generator of random numbers determined by these words and numbers."""
     words = [zlib.crc32(word.encode()) if isinstance(word, str) else word for word in what]
     state = np.random.SeedSequence(words).generate_state(1, np.uint64)
     return torch.Generator().manual_seed(int(state[0]) >> 1)
@@ -277,7 +276,7 @@ def seeded(*what: str | int) -> torch.Generator:
 def hidden_shares(
     places: Mapping[str, Floats], cameras: Mapping[str, Camera], radii_mm: Mapping[str, float]
 ) -> dict[str, Floats]:
-    """Return for each ball at places (N, 3), lab, mm, the share of its disk (C, N) that nearer disks cover."""
+    """Return for each ball at positions (N, 3), lab, mm, the share of its disk (C, N) covered by nearer disks."""
     across = torch.linspace(-1, 1, POINTS, dtype=torch.float64)
     grid = torch.cartesian_prod(across, across)
     grid = grid[grid.square().sum(1) < 1]

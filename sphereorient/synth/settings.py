@@ -13,8 +13,8 @@ class SynthSettings(BaseModel, frozen=True, extra="forbid"):
     frames: int = Field(120, ge=2, description="frames of each movie")
     frame_rate: float = Field(600.0, gt=0, description="Hz")
     exposure: float = Field(0.0004, ge=0, description="s; the picture is the mean over it")
-    exposure_samples: int = Field(2, ge=1, description="instants within the exposure that are averaged")
-    balls: int = Field(1, ge=1, le=8, description="number of balls; of several the names are a, b, ...")
+    exposure_samples: int = Field(2, ge=1, description="averaged instants of the exposure")
+    balls: int = Field(1, ge=1, le=8, description="number of balls; several are named a, b, ...")
     paints: int = Field(8, ge=1, le=8, description="different paints; fewer than balls: some look alike")
     diameter_mm: float = Field(18.0, gt=0, description="of the sphere")
     texture: Literal["blobs", "patches", "dots"] = Field("blobs", description="kind of the random paint")
@@ -22,7 +22,7 @@ class SynthSettings(BaseModel, frozen=True, extra="forbid"):
     omega_rms: float = Field(8.0, ge=0, description="rad/s per component; the paper's sphere: 7.8")
     velocity_time: float = Field(0.12, gt=0, description="correlation time of the velocity, s")
     omega_time: float = Field(0.03, gt=0, description="correlation time of the angular velocity, s")
-    periodic: bool = Field(False, description="a motion without a seam: whole turns about one axis in the movie")
+    periodic: bool = Field(False, description="a periodic motion: whole turns about one axis in the movie")
     volume_mm: float = Field(45.0, gt=0, description="the centre stays within about this distance from the origin")
     cameras: int = Field(2, ge=1, le=4, description="number of cameras, at right angles; the fourth looks aslant")
     image_size: tuple[int, int] = Field((650, 650), description="width and height, px")
@@ -31,7 +31,7 @@ class SynthSettings(BaseModel, frozen=True, extra="forbid"):
     white: float = Field(170.0, gt=0, le=255, description="grey level of lit white paint")
     black: float = Field(20.0, ge=0, le=255, description="grey level of lit black paint")
     background: float = Field(15.0, ge=0, le=255, description="grey level behind the sphere")
-    ambient: float = Field(0.5, ge=0, le=1, description="share of the light that comes evenly from everywhere")
+    ambient: float = Field(0.5, ge=0, le=1, description="share of uniform light from all directions")
     read_noise: float = Field(1.5, ge=0, description="standard deviation of a dark pixel, grey levels")
     shot_noise: float = Field(0.3, ge=0, description="grey levels per root of grey level")
     blur_px: float = Field(0.55, ge=0, description="Gaussian blur of the optics, px")
@@ -39,7 +39,7 @@ class SynthSettings(BaseModel, frozen=True, extra="forbid"):
 
     @property
     def worn(self) -> dict[str, int]:
-        """Number of the paint that each ball wears, by its name."""
+        """Number of the paint of each ball, by its name."""
         names = "abcdefgh"[: self.balls] if self.balls > 1 else (UNNAMED,)
         return {name: k % self.paints for k, name in enumerate(names)}
 

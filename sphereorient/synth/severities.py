@@ -11,8 +11,8 @@ from sphereorient.files.yaml_file import refuse_unknown
 
 LEVELS = (1, 2, 3, 4, 5)
 _Values = tuple[float, float, float, float, float]
-# scene, map: before filming; picture: constant over the movie, in the background too; frame: drawn per frame;
-# reported: in the inputs of the method only.
+# scene, map: before filming; picture: constant over the movie, also in the background; frame: drawn per frame;
+# reported: only in the inputs of the method.
 Place = Literal["scene", "map", "picture", "frame", "movie", "reported"]
 SHARE = "share of "  # prefix of units with values in 0 .. 1
 
@@ -45,28 +45,28 @@ ball_size; scene; ; px of diameter; 160 80 50 32 20
   The same scene filmed with coarser or finer pixels.
   the default ball has 78 px; at 20 px a patch of its paint is 4 px wide
 spin; scene; ; degrees per frame, rms; 5 10 20 40 60
-  The ball turns faster; the exposure is shortened so that it smears no more than before.
-  the default ball turns by 1.3; at 60 a third of the paint in sight is new in the next frame
+  The ball rotates faster; a shorter exposure keeps the motion blur.
+  the default ball rotates by 1.3; at 60 a third of the visible paint is new in the next frame
 motion_blur; scene; ; degrees per exposure, rms; 1 3 8 16 32
-  The shutter stays open longer; where the whole frame is not long enough, the ball turns faster too.
-  1.3 is a shutter that never closes on the default ball; 32 is wider than its patches of paint, 24
+  The exposure is longer; if the whole frame is not long enough, the ball also rotates faster.
+  1.3 is the whole frame for the default ball; 32 is wider than its patches of paint, 24
 paint_wear; map; 0; share of the ball's area; 0.02 0.05 0.12 0.25 0.45
-  Paint has come off the filmed ball in patches that show bare grey; the map knows nothing of it.
+  Paint has come off the filmed ball in patches that show bare grey; the map does not show this.
   a scratch after a day of mixing; at 0.45 hardly more than half of the paint is left
 uneven_light; picture; 1; ratio of bright to dark limb; 1.5 2.5 4 8 16
   One side of the ball gets less light, falling off exponentially across the disk.
   one lamp of two is dim; from 8 on white paint in the dark is as dim as black paint in the light
 highlights; picture; 0; grey levels of the peak; 40 80 120 180 255
-  Two lamps are mirrored in glossy paint: Gaussian spots, sigma 0.12 radii, that do not turn along.
+  Two lamps are mirrored in glossy paint: Gaussian spots, sigma 0.12 radii, that do not rotate with it.
   varnish instead of matt paint; from 150 on black paint under a spot is as bright as white paint
 background_clutter; picture; 0; grey levels, rms; 4 8 16 28 45
   Unmoving bright structure behind the ball; the picture without the ball shows it too.
-  a wall with stains; at 45 the structure reaches the white paint's level and the outline drowns
+  a wall with stains; at 45 the structure is as bright as white paint and hides the outline
 occlusion; frame; 0; share of the disk hidden; 0.05 0.12 0.25 0.4 0.6
   A dark disk as large as the ball hides part of it, on another side in every frame.
   the edge of another particle; above one half the centre itself is hidden
 bubbles; frame; 0; bubbles before the disk; 2 5 10 18 30
-  Bubbles of 0.12 ball radii before the ball, dark rims and a glint each, elsewhere in every frame.
+  Bubbles of 0.12 ball radii in front of the ball, with dark rims and glints, elsewhere in every frame.
   a leaking seal; 30 cover a third of the disk
 dirt; picture; 0; px of the specks' radius; 1 2 4 7 12
   Dark specks on the window, 6 in 100 x 100 px, at rest; the picture without the ball shows them too.
@@ -78,7 +78,7 @@ defocus; picture; 0; px of sigma; 0.7 1.5 3 6 10
   The lens is out of focus: a Gaussian on top of the optics' own.
   focus set by eye; at 10 patches of 16 px, the default ball's, keep a sixth of their contrast
 saturation; picture; 0; share of white paint clipped; 0.05 0.2 0.5 0.8 0.98
-  Too much light: as much that this share of the white paint in sight exceeds 255.
+  Too much light: this share of the visible white paint exceeds 255.
   the lit side clips first; at 0.98 white is flat, and its blurred borders have moved into the black
 shot_noise; frame; 0; grey levels per root of grey level; 0.5 0.8 1.2 2 3.5
   Too few photons: noise that grows with the root of the light, on top of the camera's own.
@@ -87,10 +87,10 @@ read_noise; frame; 0; grey levels; 3 6 12 20 35
   A noisy sensor: white noise of this standard deviation, on top of the camera's own.
   a warm sensor; at 35 the noise is a quarter of the step from black to white
 dropped_frames; movie; 0; share of the frames; 0.02 0.05 0.15 0.3 0.5
-  Frames of each camera are black, drawn for each camera by itself.
-  a slow disk; at 0.5 a quarter of the instants has no picture at all
+  Frames of each camera are black, drawn independently for each camera.
+  a slow disk; at 0.5 a quarter of the instants have no picture
 centre_error; reported; 0; px; 0.25 0.5 1 2 4
-  The cameras' principal points are reported wrong, in opposite directions by turns.
+  The cameras' principal points are reported wrong, in alternating directions.
   a quarter is a poor calibration; lines of sight miss each other by 1.4 times as much
 radius_error; reported; 0; px; 0.25 0.5 1 2 4
   The sphere's diameter is reported too large: by this much at the rim of the picture.
@@ -99,11 +99,11 @@ camera_rotation; reported; 0; degrees; 0.05 0.15 0.5 1.5 5
   One camera (even seeds: the second) is reported rotated about the lab's origin by equal pan, tilt and roll.
   0.05 is a fair calibration; at 5 the cameras disagree by more than the paper's grid step of 3
 camera_shift; reported; 0; mm; 0.05 0.1 0.3 1 3
-  One camera (even seeds: the second) is reported shifted along its own x, which the others see.
+  One camera (even seeds: the second) is reported shifted along its own x, which is visible to the others.
   someone touched the tripod; at 3 lines of sight pass each other by a third of a radius
 texture_error; reported; 0; share of the map's area; 0.01 0.03 0.08 0.18 0.35
-  The map that the method is given has black and white exchanged in patches.
-  a map drawn by hand; at 0.5 it would say nothing at all
+  The map given to the method has black and white exchanged in patches.
+  a map drawn by hand; at 0.5 it would have no information
 """
 
 
@@ -127,7 +127,7 @@ def degradation(name: str) -> Degradation:
 
 
 def check_values(values: Mapping[str, float], known: Iterable[str], do: str) -> None:
-    """Raise SettingsError for an unknown name, one that is not among `known`, with remedy `do`, or a wrong value."""
+    """Raise SettingsError for an unknown name, a name not among `known`, with remedy `do`, or a wrong value."""
     for name, value in values.items():
         row = degradation(name)
         if name not in known:

@@ -1,4 +1,4 @@
-"""Write synthetic experiments in the format that `sphereorient track` reads."""
+"""Writing of synthetic experiments in the format of `sphereorient track`."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -31,20 +31,20 @@ from sphereorient.synth.severities import degradation, severity
 
 PIXEL_PITCH_MM = 0.02  # of usual high-speed cameras
 DRAWS = 500  # motions tried for each ball
-NEXT_SEED = 1_000_003  # from one ball or draw to the next: no two scenes share one
+NEXT_SEED = 1_000_003  # from one ball or draw to the next, so that scenes have no seed in common
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CleanMovie:
-    """What cameras see of balls before degradations of pictures; made by `clean_movie`."""
+    """The cameras' view of balls before degradations of pictures."""
 
-    textures: Sequence[Tensor]  # (H, 2 H) of each paint, not worn
+    textures: Sequence[Tensor]  # (H, 2 H) of each paint, without wear
     truth: Mapping[str, Motion6D]  # by ball, at the times of the frames
     disks: Mapping[str, Disk]  # by camera: the first ball in the N frames
-    exposures: Mapping[str, Callable[[], Iterable[Exposure]]]  # by camera: those of the N frames
+    exposures: Mapping[str, Callable[[], Iterable[Exposure]]]  # by camera: the N exposures
 
     def kept(self) -> Self:
-        """Return it with all exposures computed, to be used more than once."""
+        """Return the movie with all exposures computed, for repeated use."""
         return replace(self, exposures={name: list(each()).__iter__ for name, each in self.exposures.items()})
 
 
@@ -128,7 +128,7 @@ def write_synthetic_experiment(
 
 
 def clean_movie(settings: SynthSettings, paint_wear: float = 0.0) -> CleanMovie:
-    """Return what the cameras see, before degradations of pictures. Raises SettingsError: no room for a ball."""
+    """Return the cameras' view before degradations of pictures. Raises SettingsError: no room for a ball."""
     motions = motions_of(settings)
     # Rounded to grey levels, as in the file.
     textures = [
@@ -147,7 +147,7 @@ def clean_movie(settings: SynthSettings, paint_wear: float = 0.0) -> CleanMovie:
     return CleanMovie(
         textures=textures,
         truth={name: motion.at(times_s) for name, motion in motions.items()},
-        # Of several balls degradations know only the cover.
+        # For several balls, degradations use only the cover.
         disks={name: picture_of_ball(one, X[0].mean(1), settings.diameter_mm / 2) for name, one in cameras.items()},
         exposures={name: partial(exposures, wearing, camera, X, R) for name, camera in cameras.items()},
     )
@@ -159,7 +159,7 @@ def frame_times_s(settings: SynthSettings) -> Tensor:
 
 
 def instants_s(settings: SynthSettings) -> Tensor:
-    """Return the instants of each exposure, (N, E) float64, s; their variance is that of the time it is open."""
+    """Return the instants of each exposure, (N, E) float64, s, with the variance of the open shutter."""
     count = settings.exposure_samples
     within = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * settings.exposure
     if count > 1:
@@ -168,7 +168,7 @@ def instants_s(settings: SynthSettings) -> Tensor:
 
 
 def motions_of(settings: SynthSettings) -> dict[str, RandomMotion]:
-    """Draw the motion of each ball, by name, so that none meets another. Raises SettingsError: no room for a ball."""
+    """Draw the motion of each ball, by name, without collisions. Raises SettingsError: no room for a ball."""
     times_s, motions, paths = instants_s(settings).reshape(-1), dict[str, RandomMotion](), list[Tensor]()
     for k, name in enumerate(settings.worn):
         for draw in range(DRAWS):
@@ -208,14 +208,14 @@ def _frames(
     lost, disks = filming.lost(name, filming.settings.frames), movie.disks[name]
     for k, exposure in enumerate(movie.exposures[name]()):
         disk = Disk(centre_px=disks.centre_px[k], radius_px=disks.radius_px[k])
-        # Lost frames draw noise too: the other frames do not depend on losses.
+        # Lost frames draw noise too, so that other frames do not depend on losses.
         frame = digitise(filming.picture(exposure, disk, name, k), filming.settings, rng)
         yield np.zeros_like(frame) if k in lost else frame
         progress(1)
 
 
 def write_truth(path: Path, truths: Mapping[str, Motion6D], cameras: Mapping[str, Camera]) -> None:
-    """Write truth.h5 (docs/data-format.md) of balls by name; the name of an only one is empty."""
+    """Write truth.h5 (docs/data-format.md) of balls by name; the name of a single ball is empty."""
     with whole_hdf5(path) as file:
         for name, truth in truths.items():
             group = ball_group(file, name)
@@ -240,8 +240,8 @@ def _true_values(truth: Motion6D, cameras: Mapping[str, Camera]) -> dict[str, Te
 
 
 def experiment_document(settings: SynthSettings, cameras: Iterable[str], suffix: str = ".mkv") -> dict[str, Any]:
-    """Return what experiment.yaml says of movies NAME.mkv (or another suffix) and backgrounds empty_NAME.png."""
-    # exposure 0 is left out: the key must be above 0.
+    """Return experiment.yaml for movies NAME.mkv (or another suffix) and backgrounds empty_NAME.png."""
+    # Leave out exposure 0: the key must be above 0.
     exposure = {"exposure": settings.exposure} if settings.exposure > 0 else {}
     names = list(cameras)
     spheres = {

@@ -14,7 +14,7 @@ from sphereorient.errors import Reason, ShapeError, TrackError, refusal
 from sphereorient.files.whole_file import LARGEST_RATIO
 
 KEY = "column"
-SPANS = 4  # stretches of frames that are named
+SPANS = 4  # most named stretches of frames
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class DatasetSpec:
     tail: tuple[int, ...] = ()  # axes after the first
     dtype: str = "float64"
     fill: float = np.nan  # value if not measured
-    since: str = ""  # first version with this dataset; older files are read without it
+    since: str = ""  # first version with this dataset; blank for older files
     rows: str = "frames"  # frames, offsets (frames + 1) or candidates
-    of_several: bool = False  # whether the track of an only sphere is without it
+    of_several: bool = False  # whether only tracks of several spheres have it
 
 
 def stored(units: str, description: str, *tail: int, **more: Any) -> Any:
@@ -37,7 +37,7 @@ def stored(units: str, description: str, *tail: int, **more: Any) -> Any:
 
 
 def in_length(text: str, length_unit: str) -> str:
-    """Return a unit or label with the lengths that it writes in mm or m: mm^2, velocity (m/s)."""
+    """Return a unit or label with its lengths, in mm or m, in the length unit: mm^2, velocity (m/s)."""
     return text if length_unit == "mm" else re.sub(r"\bmm?\b", length_unit, text)
 
 
@@ -52,18 +52,18 @@ def stored_fields(record: Any) -> Iterator[tuple[str, DatasetSpec]]:
 
 
 def blank_datasets(record: type[Any], frames: int) -> dict[str, NDArray[Any]]:
-    """Return every dataset of a record with nothing measured."""
+    """Return every dataset of a record with fill values."""
     rows = {"frames": frames, "offsets": frames + 1, "candidates": 0}
     return {name: np.full((rows[c.rows], *c.tail), c.fill, c.dtype) for name, c in stored_fields(record)}
 
 
 def check_shapes(record: object, rows: Mapping[str, int]) -> None:
-    """Raise ShapeError if a dataset of a record has another shape than declared."""
+    """Raise ShapeError if a dataset of a record differs from its declared shape."""
     for name, c in stored_fields(type(record)):
         expected, got = (rows[c.rows], *c.tail), np.shape(getattr(record, name))
         if got != expected:
             label = f"{type(record).__name__}.{name}"
-            do = "give every dataset one row a frame"
+            do = "give every dataset one row per frame"
             raise ShapeError(refusal(label, expected=f"shape {expected}", got=str(got), do=do))
 
 
@@ -80,7 +80,7 @@ def write_dataset(group: h5py.Group, place: str, values: NDArray[Any], spec: Dat
 
 
 def read_datasets(group: h5py.Group, record: type[Any]) -> dict[str, NDArray[Any]]:
-    """Return all datasets of a record by field name; those newer than the file are blank."""
+    """Return all datasets of a record by field name; datasets newer than the file are blank."""
     known = {
         name: read_dataset(group, _place(name), c.dtype).astype(c.dtype)
         for name, c in stored_fields(record)
@@ -120,7 +120,7 @@ def inside(group: h5py.Group, place: str) -> Any:
 
 
 def named_group(parent: h5py.Group, name: str) -> h5py.Group:
-    """Return a group in another one; TrackError for a link, a dataset, or a name that no message could show."""
+    """Return a group in another one; TrackError for a link, a dataset, or an unprintable name."""
     group = inside(parent, name)
     if not isinstance(group, h5py.Group) or not name.isprintable() or len(name) > 100:
         label, do = f"{parent.file.filename}: {parent.name.strip('/')}", "write the track again"
@@ -148,7 +148,7 @@ def nearest_rows(known: NDArray[Any], wanted: NDArray[Any]) -> tuple[NDArray[np.
 
 
 def span_words(mask: NDArray[np.bool_], number: NDArray[np.int64] | None = None) -> str:
-    """Return the frames (N,) of a mask in words, "0 to 79, 280 to 319": the longest; `number`: of each frame."""
+    """Return the frames (N,) of a mask as text, "0 to 79, 280 to 319", the longest ones; `number`: of each frame."""
     number = np.arange(len(mask)) if number is None else number
     runs = runs_of(mask)
     longest = sorted(sorted(runs, key=lambda run: run[0] - run[1])[:SPANS])
@@ -157,6 +157,6 @@ def span_words(mask: NDArray[np.bool_], number: NDArray[np.int64] | None = None)
 
 
 def reasons_of(texts: Any) -> tuple[str, ...]:
-    """Return stored texts (N,), bytes, as reasons; texts of newer files stay texts."""
+    """Return stored texts (N,), bytes, as reasons; unknown texts of newer files stay texts."""
     known = {str(reason): reason for reason in Reason}
     return tuple(known.get(text, text) for text in (each.decode() for each in texts.tolist()))

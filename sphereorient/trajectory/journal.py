@@ -1,6 +1,6 @@
-"""A track that is still being measured, in a file beside it that only grows: readable at any time, also after a kill.
-The first line is JSON with the attributes of the track; then a row of fixed length for each frame (`row_type`). A part
-of a row at the end is ignored.
+"""A track during its measurement, in a file beside it that only grows and is readable at any time, also after a kill.
+The first line is JSON with the attributes of the track; then a row of fixed length for each frame (`row_type`). An
+incomplete row at the end is ignored.
 """
 
 import json
@@ -16,7 +16,7 @@ from sphereorient.trajectory.datasets import blank_datasets, reasons_of, stored_
 
 SCHEMA = "sphereorient-journal/1"
 MARK = f'{{"schema": "{SCHEMA}"'.encode()
-# What is known of a frame without those that come later.
+# Datasets of a frame that do not depend on later frames.
 OF_FRAME = (
     *("time", "valid", "position", "position_cov", "orientation", "orientation_cov", "segment", "flags"),
     *("position_systematic_cov", "orientation_systematic_cov", "margin", "margin_angle"),
@@ -26,7 +26,7 @@ ABOUT = ("method", "settings", "experiment", "length_unit", "provenance")
 
 
 def journal_path(track: Path) -> Path:
-    """Return where the rows of a track are until it is whole."""
+    """Return the path of the rows of a track until it is complete."""
     return track.with_name(track.name + ".partial")
 
 
@@ -39,7 +39,7 @@ def row_type(track: type[Any], camera: type[Any], cameras: Sequence[str]) -> np.
 
 
 def head(track: Any) -> bytes:
-    """Return the first line of the journal of a track, whose frames do not count."""
+    """Return the first line of a track's journal, independent of its frames."""
     rate = track.frame_rate if math.isfinite(track.frame_rate) else None
     content = {"schema": SCHEMA, "frame_rate": rate, "cameras": sorted(track.cameras)}
     return json.dumps(content | {name: getattr(track, name) for name in ABOUT}).encode() + b"\n"
@@ -61,14 +61,14 @@ def rows(track: Any) -> bytes:
 
 
 def is_journal(path: Path) -> bool:
-    """Return whether a file is a journal; raise OSError where it cannot be read."""
+    """Return whether a file is a journal; raise OSError if it cannot be read."""
     with path.open("rb") as file:
         return file.read(len(MARK)) == MARK
 
 
 def read_journal(file: BinaryIO, track: type[Any], camera: type[Any]) -> dict[str, Any]:
-    """Return the fields of the track of a journal, as far as it was written; what is not in it is read-only.
-    Raises LookupError, TypeError, ValueError: its first line is damaged; OSError: it cannot be read.
+    """Return the fields of the track of a journal, as far as written; other fields are blank and read-only. Raises
+    LookupError, TypeError, ValueError: the first line is damaged; OSError: unreadable file.
     """
     about = json.loads(file.readline(10_000_000))
     kind = row_type(track, camera, about["cameras"])
@@ -86,7 +86,7 @@ def read_journal(file: BinaryIO, track: type[Any], camera: type[Any]) -> dict[st
 
 
 def _nothing(record: type[Any], frames: int) -> dict[str, NDArray[Any]]:
-    """Return every dataset of a record with nothing measured, without memory for it: read-only."""
+    """Return every dataset of a record with fill values, read-only, without using memory."""
     return {
         name: np.broadcast_to(one[:1], (frames + len(one) - 1, *one.shape[1:])) if len(one) else one
         for name, one in blank_datasets(record, 1).items()

@@ -1,4 +1,4 @@
-"""Orientations of tracks as NumPy arrays (N, 3, 3): rotation vectors, angles, distances; NaN where one is not known."""
+"""Orientations of tracks as NumPy arrays (N, 3, 3): rotation vectors, angles, distances; NaN if unknown."""
 
 import numpy as np
 import torch
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from sphereorient import so3
 
 Floats = NDArray[np.float64]
-AT_POLE = 0.02  # |cos theta_y| below which theta_x and theta_z turn about nearly the same axis
+AT_POLE = 0.02  # |cos theta_y| below which the axes of theta_x and theta_z nearly coincide
 
 
 def rotation_vectors(R: Floats) -> Floats:
@@ -30,18 +30,18 @@ def distance_rad(A: Floats, B: Floats) -> Floats:
 
 
 def distance_deg(A: Floats, B: Floats) -> Floats:
-    """Return the same in degrees."""
+    """Return the angles (N,), degrees, between orientations (N, 3, 3)."""
     return np.rad2deg(distance_rad(A, B))
 
 
 def tait_bryan(R_lab_body: Floats) -> Floats:
     """Return theta_x, theta_y, theta_z (N, 3), rad, of orientations. Source: docs/errata.md E1."""
-    known = np.isfinite(R_lab_body.reshape(-1, 9)).all(1, keepdims=True)  # of NaN it makes theta_z = 0, as at a pole
+    known = np.isfinite(R_lab_body.reshape(-1, 9)).all(1, keepdims=True)  # for NaN it gives theta_z = 0, as at a pole
     return np.where(known, so3.to_tait_bryan(torch.from_numpy(R_lab_body)).numpy(), np.nan)
 
 
 def tait_bryan_sigma(R_lab_body: Floats, cov_lab_rad2: Floats) -> Floats:
-    """Return the sigmas of these angles (N, 3), rad; NaN near the poles. Source: docs/errata.md E3."""
+    """Return the sigmas of the Tait-Bryan angles (N, 3), rad; NaN near the poles. Source: docs/errata.md E3."""
     theta = tait_bryan(R_lab_body)
     there, sigma = np.isfinite(theta).all(1) & (np.abs(np.cos(theta[:, 1])) > AT_POLE), np.full_like(theta, np.nan)
     inverse = np.linalg.inv(so3.rate_matrix_lab(torch.from_numpy(theta[there])).numpy())

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from sphereorient.trajectory.walk import Walk
 
 SCHEMA = "sphereorient-track/1"
-SCHEMA_MINOR = 1  # `score` of the precise method: evidence for the painted ball
-SCHEMA_OF_SEVERAL = "sphereorient-track/2"  # with a group SPHERES/NAME each
+SCHEMA_MINOR = 1  # since then `score` of the precise method is evidence for the painted ball
+SCHEMA_OF_SEVERAL = "sphereorient-track/2"  # with a group SPHERES/NAME for each sphere
 TEXTS = ("method", "settings", "experiment")
 HELD = 0.1  # of the position's stated error
 AGAIN = "write the track again"
@@ -44,7 +44,7 @@ PLOTTED = (
 COLOURS = {"w": "#666666", "x": "#D55E00", "y": "#009E73", "z": "#0072B2"}  # of the axes, in every figure
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-NO_PICTURE = (Reason.MISSING, Reason.UNDECODABLE, Reason.REPEATED)  # say nothing of the ball
+NO_PICTURE = (Reason.MISSING, Reason.UNDECODABLE, Reason.REPEATED)  # without information on the ball
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,8 +96,8 @@ class CameraTrack:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory:
-    """All results on one sphere in N frames; NaN if not measured; `track[10:50]` is a part.
-    Units: s, rad, mm, m/s, m/s^2; with `length_unit` "radii" radii, radii/s, radii/s^2.
+    """All results on one sphere in N frames; NaN if not measured; `track[10:50]` is a part. Units: s, rad, mm, m/s,
+    m/s^2; with `length_unit` "radii" radii, radii/s, radii/s^2.
     """
 
     time: Floats = stored("s", "frame number of the experiment / frame rate; middle of the exposure")
@@ -184,7 +184,7 @@ class Trajectory:
 
     @property
     def held(self) -> bool:
-        """Whether the centre is fixed: over the track it moves by less than a tenth of its stated error."""
+        """Whether the centre is fixed: its motion over the track is less than a tenth of its stated error."""
         there = self.valid & np.isfinite(self.position).all(1)
         if there.sum() < 2:
             return False
@@ -221,12 +221,12 @@ class Trajectory:
         return cls(cameras={name: CameraTrack.empty(len(time)) for name in cameras}, **parts, **known)
 
     def save(self, path: str | Path) -> None:
-        """Write HDF5 of schema sphereorient-track/1, as `Tracks.save` of one ball."""
+        """Write HDF5 of schema sphereorient-track/1, as `Tracks.save` for one ball."""
         Tracks.of(self).save(path)
 
     @classmethod
     def load(cls, path: str | Path) -> "Trajectory":
-        """Read the track of one ball, as `Tracks.load`; raise TrackError also for those of several."""
+        """Read the track of one ball, as `Tracks.load`; raise TrackError also for tracks of several."""
         return one_track(Tracks.load(path), str(path))
 
     def __getitem__(self, frames: slice | int) -> Self:
@@ -261,7 +261,7 @@ class Trajectory:
 
     @property
     def posed(self) -> Floats:
-        """R_lab_body (N, 3, 3): measured, else the smoother's, else NaN."""
+        """R_lab_body (N, 3, 3): measured, else by the smoother, else NaN."""
         known = np.isfinite(self.orientation).all(axis=(1, 2), keepdims=True)
         return np.where(known, self.orientation, self.orientation_smooth)
 
@@ -272,8 +272,8 @@ class Trajectory:
         return Rotation.from_matrix(self.orientation[self.valid])
 
     def walk(self) -> "Walk":
-        """Return how an animal walks on the ball, by `posed`, the lab being its frame; see `walk_of`."""
-        from sphereorient.trajectory.walk import walk_of  # it computes with torch
+        """Return the walk of an animal on the ball, by `posed`, with the lab as its frame; see `walk_of`."""
+        from sphereorient.trajectory.walk import walk_of  # imports torch
 
         return walk_of(self.time, self.posed)
 
@@ -299,7 +299,7 @@ class Trajectory:
 
     @cached_property
     def without_ball(self) -> Bools:
-        """Frames in which no camera that has a picture shows a ball, (N,) bool."""
+        """Frames without a ball in any camera that has a picture, (N,) bool."""
         if not self.cameras:
             return np.zeros(len(self), bool)
         reasons = np.array([camera.reason for camera in self.cameras.values()], object)
@@ -307,9 +307,7 @@ class Trajectory:
         return np.asarray(~self.valid & none.any(0) & (none | unknown).all(0))
 
     def summary(self) -> dict[str, Any]:
-        """Return the numbers of `frames`, `valid`, `no_ball`, and `lost`: the rest by camera and reason, frequent ones
-        first.
-        """
+        """Return the numbers of `frames`, `valid`, `no_ball`, and `lost` frames, these by camera and reason."""
         lost, none = {}, self.without_ball
         for name, camera in self.cameras.items():
             reasons = (why for why, absent in zip(camera.reason, none, strict=True) if not absent)
@@ -319,7 +317,7 @@ class Trajectory:
 
 
 class Tracks(Mapping[str, Trajectory]):
-    """Trajectories of the spheres of one recording by name, with the same times; an only sphere's name is empty."""
+    """Trajectories of the spheres of one recording by name, with the same times; a single sphere's name is empty."""
 
     def __init__(self, tracks: Mapping[str, Trajectory]) -> None:
         times = [track.time for track in tracks.values()]
@@ -345,13 +343,13 @@ class Tracks(Mapping[str, Trajectory]):
 
     @classmethod
     def of(cls, tracks: Trajectory | Mapping[str, Trajectory]) -> Self:
-        """Return tracks by name, or those of one trajectory."""
+        """Return tracks by name, or the tracks of one trajectory."""
         return cls({tracks.sphere: tracks} if isinstance(tracks, Trajectory) else tracks)
 
     def save(self, path: str | Path) -> None:
-        """Write HDF5, replacing an old file at the end; equal arrays give equal bytes. One ball is schema
-        sphereorient-track/1, several are sphereorient-track/2: a group /spheres/NAME each, like such a file.
-        Raises OutputError: the file cannot be written.
+        """Write HDF5, replacing an old file at the end; equal arrays give equal bytes. One ball has schema
+        sphereorient-track/1, several have sphereorient-track/2: a group /spheres/NAME each, like such a file. Raises
+        OutputError: the file cannot be written.
         """
         with whole_hdf5(Path(path)) as file:
             if len(self) == 1:
@@ -364,8 +362,8 @@ class Tracks(Mapping[str, Trajectory]):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file written by `save`, or the rows so far of a `live` that goes on or was killed. Raises TrackError:
-        no HDF5 file, another schema, or a dataset missing or of wrong shape.
+        """Read a file written by `save`, or the rows so far of a running or killed `live`. Raises TrackError: no HDF5
+        file, another schema, or a dataset missing or of wrong shape.
         """
         with opened_track(path) as file:
             if not isinstance(file, h5py.File):
@@ -389,7 +387,7 @@ class Tracks(Mapping[str, Trajectory]):
 
 
 def one_track(found: "Trajectory | Tracks", name: str = "tracks") -> Trajectory:
-    """Return the track of an only ball; raise TrackError, with `name`, for those of several."""
+    """Return the track of a single ball; raise TrackError, with `name`, for tracks of several."""
     tracks = Tracks.of(found)
     if len(tracks) == 1:
         return next(iter(tracks.values()))
@@ -420,7 +418,7 @@ def _continuous(quat_wxyz: Floats) -> Floats:
 
 @contextmanager
 def opened_track(path: str | Path) -> Iterator[h5py.File | BinaryIO]:
-    """Open the file of a track, or the journal of one that is not whole; TrackError if it is neither, or damaged."""
+    """Open the file of a track, or its journal if incomplete; TrackError if it is neither, or damaged."""
     path = Path(path)
     got, do = "no file", "pass the track.h5 that `sphereorient track` wrote"
     try:
@@ -428,7 +426,7 @@ def opened_track(path: str | Path) -> Iterator[h5py.File | BinaryIO]:
             got = "something else"
         elif journal.journal_path(path).is_file():
             path = journal.journal_path(path)
-        if not path.is_file():  # opening a pipe would block
+        if not path.is_file():  # opening a pipe may block
             raise FileNotFoundError(path)
         file = path.open("rb") if journal.is_journal(path) else h5py.File(path, "r")
     except (OSError, ValueError, RuntimeError) as error:
@@ -442,7 +440,7 @@ def opened_track(path: str | Path) -> Iterator[h5py.File | BinaryIO]:
 
 
 def read_track(group: h5py.Group) -> Trajectory:
-    """Read what `write_track` wrote; unknown datasets and attributes are ignored."""
+    """Read a track written by `write_track`; unknown datasets and attributes are ignored."""
     schema, name = group.attrs.get("schema"), f"{group.file.filename}{group.name.rstrip('/')}"
     if schema != SCHEMA:
         got, do = repr(str(schema))[1:60].strip("'"), "pass a track, or update sphereorient where the track is newer"
@@ -468,7 +466,7 @@ def read_track(group: h5py.Group) -> Trajectory:
 
 
 def write_track(track: Trajectory, group: h5py.Group) -> None:
-    """Write a track into an empty group: a file, or the group of one ball of several."""
+    """Write a track into an empty group: a file, or the group of one of several balls."""
     group.attrs["schema"], group.attrs["schema_minor"] = SCHEMA, SCHEMA_MINOR
     group.attrs["provenance"] = json.dumps(track.provenance, sort_keys=True)
     for name in (*TEXTS, "frame_rate", "length_unit"):

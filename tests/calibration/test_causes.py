@@ -88,7 +88,7 @@ def test_a_wrong_diameter_is_named_with_the_right_one(percent):
     found = compare_cameras(seen_by(CAMERAS, diameter_mm=MM * (1 + percent / 100)), LIMITS)
     assert found.contradicts
     assert not found.deadly
-    assert found.advice.startswith(f"sphere.diameter 18 explains the pictures if it is {MM * (1 + percent / 100):.4g}")
+    assert f"fit sphere.diameter {MM * (1 + percent / 100):.4g}, not 18" in found.advice
     assert found.gap_px < 0.3
 
 
@@ -97,7 +97,7 @@ def test_a_turned_camera_is_named(name, axis):
     """Before: 30 of 30 frames valid with 0.03 degrees stated, whichever camera was turned."""
     found = compare_cameras(reported(seen_by(CAMERAS), CAMERAS | {name: turned(CAMERAS[name], 1.5, axis)}), LIMITS)
     assert found.contradicts
-    assert f"{name} turned by 1.5 degrees" in found.advice
+    assert f"{name} rotated by 1.5 degrees" in found.advice
 
 
 def test_a_moved_camera_is_named():
@@ -106,7 +106,7 @@ def test_a_moved_camera_is_named():
     moved = replace(one, T_cam_lab_mm=one.T_cam_lab_mm + torch.tensor([4.0, 0.0, 0.0]))
     found = compare_cameras(reported(seen_by(CAMERAS), CAMERAS | {"cam2": moved}), LIMITS)
     assert found.contradicts
-    assert "cam2 turned by 0.4" in found.advice  # 4 mm at 520 mm: this noise does not tell one from the other
+    assert "cam2 rotated by 0.4" in found.advice  # 4 mm at 520 mm: this noise does not tell one from the other
 
 
 def test_swapped_movies_are_deadly():
@@ -198,7 +198,7 @@ def test_of_three_cameras_the_one_that_contradicts_the_others_is_named_alone(wro
     assert majority(turned_one, LIMITS) == others
     found = compare_cameras(turned_one, LIMITS)
     assert found.contradicts
-    assert found.advice.startswith(f"{name} turned by 1.5 degrees")
+    assert found.advice.startswith(f"{name} rotated by 1.5 degrees")
     assert not any(other in found.advice for other in THREE if other != name)
 
 

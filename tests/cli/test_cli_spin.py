@@ -60,7 +60,7 @@ def test_a_spin_is_measured_and_written(flight, monkeypatch, capsys):
         ({"times.csv": "file,t_s\n0.png,0\n"}, "a time of 1.png"),
         ({"times.csv": "file,t_s\n" + "".join(f"{k}.png,now\n" for k in range(6))}, "times in seconds"),
         ({"times.csv": "file,t_s\n" + "".join(f"{k}.png,1\n" for k in range(6))}, "one of them twice"),
-        ({"times.csv": b"\xff\xfe\x00"}, "no text"),
+        ({"times.csv": b"\xff\xfe\x00"}, "not UTF-8"),
         ({"dots.csv": "a,b,c\n"}, "a table of numbers"),
         ({"dots.csv": "1,0\n"}, "three columns, got 2"),
         ({"dots.csv": "20,0,0\n"}, "directions of length 1"),

@@ -265,7 +265,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "other size": (replacing("cameras.yaml", "- 650", "- 640"), ["640 x 640", "650 x 650"]),
     "no frames left": (adding("start: {cam1: 40}"), ["0 (cam1)", "40 (cam2)", "correct start:"]),
     "masks": (adding("masks: {cam1: m.png}"), ["m.png", "no such file", "hides the ball"]),
-    "fixed": (fixed, ["a ball that turns in its place"]),
+    "fixed": (fixed, ["a ball that rotates in its place"]),
     "no ball": (no_ball, ["sphere in some frame", "not_found"]),
 }
 

@@ -96,7 +96,7 @@ def test_a_ball_that_is_taken_as_fixed_is_refused_with_what_to_write(scene):
     experiment = load_experiment(scene.path).with_sphere(fixed=True, sways=False)
     with (
         open_recording(experiment, None, textured=False) as recording,
-        pytest.raises((PaintError, ExperimentError), match=r"sways|turns in its place"),
+        pytest.raises((PaintError, ExperimentError), match=r"sways|rotates in its place"),
     ):
         held_place(recording, SETTINGS.paint, SETTINGS.locate)
 

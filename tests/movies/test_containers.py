@@ -101,7 +101,7 @@ def test_frames_that_an_edit_list_hides_are_not_missing(tmp_path):
     path.write_bytes(content[: len(content) - 200])
     movie = open_movie(path)
     assert len(movie) < 7
-    assert remark(movie, "truncated: its header tells of 12")
+    assert remark(movie, "truncated: its header states 12")
 
 
 @pytest.mark.parametrize("interlaced", [True, False])
@@ -210,7 +210,7 @@ def test_a_cut_off_ome_movie_gives_its_pages_and_says_so(tmp_path):
             file.write(pictures()[k], description=ome if k == 0 else None, metadata=None, contiguous=False)
     movie = open_movie(tmp_path / "movie.ome.tif")
     assert np.array_equal(np.stack(list(movie.frames())), pictures()[:20])
-    assert remark(movie, "header tells of 30 frames, 20 are there")
+    assert remark(movie, "header states 30 frames, the file holds 20")
 
 
 def test_a_part_of_an_ome_movie_in_several_files_is_refused(tmp_path):

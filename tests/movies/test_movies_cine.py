@@ -127,7 +127,7 @@ def test_a_header_that_claims_a_billion_frames_allocates_nothing(tmp_path):
     movie = open_movie(path)
     assert tracemalloc.get_traced_memory()[1] < 2_000_000
     tracemalloc.stop()
-    assert "tells of 1000000000 frames" in movie.remarks[0]
+    assert "states 1000000000 frames" in movie.remarks[0]
     assert np.array_equal(movie.sample(range(FRAMES)), pictures())
 
 
@@ -140,7 +140,7 @@ def test_the_frames_of_a_cut_off_movie_are_there(tmp_path):
     for whole, spare in ((1, 0), (12, 7), (29, pitch - 1)):
         path.write_bytes(content[: at_images + whole * pitch + spare])
         movie = open_movie(path)
-        assert movie.remarks == (f"truncated: its header tells of 30 frames, {whole} are there",)
+        assert movie.remarks == (f"truncated: its header states 30 frames, the file holds {whole}",)
         assert np.array_equal(movie.sample(range(whole)), pictures()[:whole])
         assert len(movie.times_s) == whole
     path.write_bytes(content[: at_images + pitch - 1])

@@ -48,7 +48,7 @@ def test_movie_tells_what_is_in_a_file_and_draws_it(tmp_path, monkeypatch, capsy
     for words in (
         ".cine, 16 bit (12 of them used)",
         "51 x 37 px, 16 bit",
-        "truncated: its header tells of 30 frames, 28 are there",
+        "truncated: its header states 30 frames, the file holds 28",
         "not even: usually 600 Hz, 1 of 27 steps differ",
         "after frame 11",
         "black         1 frame: 4",

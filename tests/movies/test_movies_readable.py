@@ -67,7 +67,7 @@ def test_a_packet_that_is_gone_leaves_its_number_behind(tmp_path):
     assert 12 in lost
     assert len(lost) < 10
     assert all(frame is None or np.array_equal(frame, pictures()[number]) for number, frame in enumerate(read))
-    assert "leave out" in movie.remarks[0]
+    assert "time stamps" in movie.remarks[0]
 
 
 REORDERED = {"bf": "2", "b_strategy": "0", "sc_threshold": "0", "g": "8", "qp": "4"}

@@ -104,7 +104,7 @@ def test_a_tiff_of_several_axes_or_other_numbers_is_refused(tmp_path):
         tifffile.imwrite(path, np.zeros((3, 20, 30), dtype), photometric="minisblack")
         refused(path, "grey or RGB pages of 8 or 16 bit")
     tifffile.imwrite(path, np.zeros((20, 30), np.uint8), extratags=[(274, 3, 1, 6, True)])
-    refused(path, "not turned by 90 degrees")
+    refused(path, "not rotated by 90 degrees")
 
 
 def test_a_page_of_another_size_is_one_unreadable_frame(tmp_path):
@@ -122,7 +122,7 @@ def test_a_cut_off_stack_gives_its_whole_frames(tmp_path, imagej):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     movie = open_movie(path)
     assert 10 < len(movie) < FRAMES
-    assert movie.remarks == (f"truncated: its header tells of 30 frames, {len(movie)} are there",)
+    assert movie.remarks == (f"truncated: its header states 30 frames, the file holds {len(movie)}",)
     assert np.array_equal(movie.sample(range(len(movie))), pictures()[: len(movie)])
 
 
@@ -132,7 +132,7 @@ def test_a_cut_off_numpy_file_gives_its_whole_frames(tmp_path, spare):
     content = (tmp_path / "movie.npy").read_bytes()
     (tmp_path / "movie.npy").write_bytes(content[: 128 + 12 * 37 * 51 + spare])
     movie = open_movie(tmp_path / "movie.npy")
-    assert movie.remarks == ("truncated: its header tells of 30 frames, 12 are there",)
+    assert movie.remarks == ("truncated: its header states 30 frames, the file holds 12",)
     assert np.array_equal(np.stack(list(movie.frames())), pictures()[:12])
 
 
@@ -208,7 +208,7 @@ def test_a_claim_of_a_billion_frames_allocates_nothing(tmp_path, chunks):
         refused(path, "1000000000 of which none was written")
     else:
         movie = open_movie(path)
-        assert "tells of 1000000000 frames, 3 are there" in movie.remarks[0]
+        assert "states 1000000000 frames, the file holds 3" in movie.remarks[0]
         assert [frame is None for frame in movie.readable()] == [True, True, False]
     assert tracemalloc.get_traced_memory()[1] < 2_000_000
     tracemalloc.stop()

@@ -107,9 +107,9 @@ def test_a_saved_picture_can_be_clicked_again(marking):
     [
         ("save/1", {"points": clicks((0, 0), (2, 0), (0, 2))}, "columns and rows up to a rotation"),
         ("save/1", {"points": clicks((0, 0), (3, 0), (0, -2))}, "mirror image"),
-        ("save/1", {"points": [[-9.0, 5.0], [1.0, 2.0]]}, "origin: expected a place inside 480 x 400 px"),
+        ("save/1", {"points": [[-9.0, 5.0], [1.0, 2.0]]}, "origin: expected a point inside 480 x 400 px"),
         ("save/1", {"points": [["a", 5.0], [1.0, 2.0]]}, "two or three pairs"),
-        ("save/1", {"points": [[float("nan"), 5.0], [1.0, 2.0]]}, "a place inside"),
+        ("save/1", {"points": [[float("nan"), 5.0], [1.0, 2.0]]}, "a point inside"),
         ("save/1", [1], "two or three pairs"),
         ("try/1", {"points": [[1.0, 2.0]]}, "two or three pairs"),
         ("save/7", {"points": clicks(*PLATE.fiducials)}, "0 .. 1"),

@@ -154,7 +154,7 @@ def test_what_cannot_be_rendered_is_refused(texture, R):
         SphereRenderer(texture, size_px=8)(R[..., :2])
     with pytest.raises(ShapeError, match="position_mm"):
         SphereRenderer(texture, size_px=8)(R, torch.zeros(2))
-    with pytest.raises(CameraError, match="seen whole"):
+    with pytest.raises(CameraError, match="visible ball"):
         SphereRenderer(texture, radius_mm=9.0, camera=near_camera())(R, f64([0, -260.0, 0]))
 
 

@@ -97,5 +97,5 @@ def test_a_ball_that_touches_the_wall_is_refused():
     lens = LENSES["near"]
     normal = lens.port.normal_lab
     at_the_wall = PLACE["near"] + (lens.port.offset_mm - 0.5 * RADIUS_MM - PLACE["near"] @ normal) * normal
-    with pytest.raises(CameraError, match="seen whole"):
+    with pytest.raises(CameraError, match="visible ball"):
         render_frame(scene(), lens, at_the_wall[None], TURN[None], seeded(0))

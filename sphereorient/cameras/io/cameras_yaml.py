@@ -22,7 +22,7 @@ KEYS = ("cameras", "covariance")
 MOST = 100  # cameras of a file
 Triple = tuple[float, float, float]
 IN_ITS_OWN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0)  # frame: R and T
-# By the number of a key's parts.
+# By the number of parts of a key.
 HOLDS: dict[int, Any] = {0: float, 2: tuple[float, float], 3: Triple, 4: tuple[float, float, float, float]}
 
 # To add a model: one file with the camera, one name here.
@@ -64,11 +64,11 @@ class CovarianceEntry(Entry):
 
 
 class CameraEntry(Entry):
-    """The keys that all models share."""
+    """The keys common to all models."""
 
     model: str
     image_size: tuple[int, int]
-    R: tuple[Triple, Triple, Triple] | None = None  # None, with T: the only camera, whose frame is the lab
+    R: tuple[Triple, Triple, Triple] | None = None  # None, with T: a single camera, whose frame is the lab
     T: Triple | None = None
     port: PortEntry | None = None
     covariance: CovarianceEntry | None = None
@@ -87,7 +87,7 @@ ENTRIES = {name: _entry(kind) for name, kind in MODELS.items()}
 
 
 def add_model(kind: type[CameraModel]) -> None:
-    """Let cameras.yaml name another model, a dataclass with `MODEL` and `KEYS`, in this process."""
+    """Register another model, a dataclass with `MODEL` and `KEYS`, for cameras.yaml, in this process."""
     MODELS[kind.MODEL], ENTRIES[kind.MODEL] = kind, _entry(kind)
 
 
@@ -111,7 +111,7 @@ def load_cameras(path: Path | str) -> dict[str, Camera]:
 
 def load_covariance(path: Path | str, cameras: Mapping[str, Camera]) -> ParameterCovariance | None:
     """Read the joint covariance of the given cameras from cameras.yaml, with parameters named camera.parameter.
-    Without a joint one: the cameras' own as independent blocks, None where one is missing. CameraError if impossible.
+    Without a joint one: the cameras' own as independent blocks; None if one is missing. CameraError if impossible.
     """
     path = Path(path)
     entry = read_document(path, SCHEMA, CameraError).get("covariance")
@@ -134,8 +134,8 @@ def save_cameras(
     unplaced: Collection[str] = (),
 ) -> None:
     """Write cameras, by name, to a file that `load_cameras` reads back to the last bit; replace an old file atomically.
-    `comment` stands at its top; `covariance` is that of a joint fit; cameras named in `unplaced` get no R and T.
-    Raises CameraError (a model that is not in MODELS), OutputError (a file that cannot be written).
+    `comment` comes first in the file; `covariance`: of a joint fit; cameras named in `unplaced` get no R and T. Raises
+    CameraError (a model that is not in MODELS), OutputError (a file that cannot be written).
     """
     document: dict[str, Any] = {"cameras": {name: _described(camera) for name, camera in cameras.items()}}
     for name in unplaced:
@@ -201,7 +201,7 @@ def _covariance_keys(covariance: ParameterCovariance | None) -> dict[str, Any]:
 
 
 def _independent(cameras: Mapping[str, Camera]) -> ParameterCovariance | None:
-    """Return the cameras' own covariances as diagonal blocks; None where a camera has none."""
+    """Return the cameras' own covariances as diagonal blocks; None if a camera has none."""
     parts = {name: camera.covariance for name, camera in cameras.items() if camera.covariance is not None}
     if not parts or len(parts) < len(cameras):
         return None

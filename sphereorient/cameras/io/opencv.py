@@ -1,4 +1,4 @@
-"""Camera files with OpenCV's lens: those of OpenCV, ROS, anipose and COLMAP, and of scripts with OpenCV's names."""
+"""Camera files with OpenCV's lens: of OpenCV, ROS, anipose, COLMAP, and of scripts with OpenCV's names."""
 
 import re
 import tomllib
@@ -26,7 +26,7 @@ MOST_NODES = 200_000  # OpenCV's sample adds the corners of all pictures
 # Names of lens models; True: the coefficients are k1 to k4 of cv2.fisheye.
 FISHEYE = {"": False, "plumb_bob": False, "radtan": False, "rational_polynomial": False}
 FISHEYE |= {"fisheye": True, "equidistant": True}
-# What keys mean, without case and underscores.
+# Meanings of keys, without case and underscores.
 KEYS = {
     "camera_matrix": "cameramatrix intrinsicmatrix matrix mtx k m",
     "distortion_coefficients": "distortioncoefficients distortions distortion distcoeffs distcoeff dist d",
@@ -41,34 +41,33 @@ KEYS = {
 }
 MEANING = {name: meaning for meaning, names in KEYS.items() for name in names.split()}
 SIDE = re.compile(r"(.+?)(?:(1|left|l)|(2|right|r))")  # keys of a stereo pair, likewise
-RECTIFIED = {"p", "projectionmatrix"}  # beside one of them ROS' R turns the rectified picture, and is no pose
+RECTIFIED = {"p", "projectionmatrix"}  # with one of them ROS' R rotates the rectified picture, and is no pose
 # COLMAP's models and their numbers of parameters. Source: its sensor/models.h.
 COLMAP = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "FULL_OPENCV": 12}
 COLMAP |= {"SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "OPENCV_FISHEYE": 8}
 
 Floats = NDArray[np.float64]
 Tree = dict[str, Any]  # a file, or a part of it
-Said = dict[str, tuple[str, Any]]  # key and value in a file, by what the key means
-Part = tuple[str, Said, list[str]]  # a camera's name, what the file says of it, and the keys that are not used
+Said = dict[str, tuple[str, Any]]  # key and value in a file, by the meaning of the key
+Part = tuple[str, Said, list[str]]  # a camera's name, its entries in the file, and the unused keys
 
 
 @dataclass(frozen=True, kw_only=True)
 class FoundCamera:
     """A camera in a file of another program."""
 
-    name: str  # that of the file where it has no other camera
+    name: str  # the file's name for a single camera
     camera: Camera
-    placed: bool = True  # False: the file has no R and T, and the camera's frame is the lab
+    placed: bool = True  # False: no R and T in the file; the camera's frame is the lab
     unread: tuple[str, ...] = ()  # keys of the file that were not used
 
 
 def load_camera_files(paths: Sequence[Path | str], image_size: tuple[int, int] | None = None) -> list[FoundCamera]:
-    """Read cameras whose lens is OpenCV's; the first pixel's centre is (0, 0), T is taken as mm.
-    A file is OpenCV's YAML, XML or JSON, ROS' camera_info, anipose's TOML, COLMAP's cameras.txt, or any YAML, JSON or
-    TOML with keys of `KEYS`: of one camera, of several by name, or of a stereo pair (M1, D1, M2, D2, R, T). A file of R
-    and T alone belongs to the one before. `image_size` (W, H), px, is for files without it.
-    Raises CameraError: another file, a missing or impossible key, shear, a lens other than k1, k2, p1, p2, k3 or
-    cv2.fisheye's k1 to k4.
+    """Read cameras whose lens is OpenCV's; the first pixel's centre is (0, 0), T is taken as mm. A file is OpenCV's
+    YAML, XML or JSON, ROS' camera_info, anipose's TOML, COLMAP's cameras.txt, or any YAML, JSON or TOML with keys of
+    `KEYS`: of one camera, of several by name, or of a stereo pair (M1, D1, M2, D2, R, T). A file of R and T alone
+    belongs to the one before. `image_size` (W, H), px, is for files without it. Raises CameraError: another file, a
+    missing or impossible key, shear, a lens other than k1, k2, p1, p2, k3 or cv2.fisheye's k1 to k4.
     """
     trees: list[tuple[Path, Tree]] = []
     for path in map(Path, paths):
@@ -91,7 +90,7 @@ def load_camera_files(paths: Sequence[Path | str], image_size: tuple[int, int] |
 
 
 def _tree(path: Path) -> Tree:
-    """Parse a file into mappings, lists, numbers and texts; numbers may be texts still."""
+    """Parse a file into mappings, lists, numbers and texts; numbers may still be texts."""
     content = read_whole(path, TEXT_BYTES, "a camera file", CameraError, "correct the path")
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -106,7 +105,7 @@ def _tree(path: Path) -> Tree:
             return tomllib.loads(text)
         if suffix == ".xml":
             tree = _xml(ElementTree.fromstring(text))
-        else:  # JSON is YAML but for tabs; OpenCV's first line and its tags are not
+        else:  # JSON is YAML except for tabs; OpenCV's first line and tags are not
             text = re.sub(r"\A%YAML.*|!!opencv-[a-z-]+", "", text.replace("\t", " "))
             tree = parse_yaml(text, MOST_NODES)
     except (*FAULTS, ElementTree.ParseError, RecursionError) as fault:
@@ -117,7 +116,7 @@ def _tree(path: Path) -> Tree:
 
 
 def _xml(element: ElementTree.Element) -> Any:
-    """Return an element of OpenCV's XML, where list entries are called _ and the numbers of a matrix are one text."""
+    """Return an element of OpenCV's XML, in which list entries are named _ and a matrix is one text."""
     if not len(element):
         words = (element.text or "").split()
         return words[0] if len(words) == 1 else words
@@ -151,7 +150,7 @@ def _colmap(path: Path, text: str) -> Tree:
 
 
 def _parts(path: Path, tree: Tree) -> list[Part]:
-    """Return the cameras in a file; none where it has none."""
+    """Return the cameras in a file; empty if there are none."""
     said = _said(tree)
     if "camera_matrix" in said:
         return [(path.name.partition(".")[0], said, _unread(tree, said))]
@@ -163,7 +162,7 @@ def _parts(path: Path, tree: Tree) -> list[Part]:
 
 
 def _pair(tree: Tree, said: Said) -> list[Part]:
-    """Return both cameras of a stereo pair, X_2 = R X_1 + T, the lab being the frame of the first."""
+    """Return both cameras of a stereo pair, X_2 = R X_1 + T; the lab is the frame of the first."""
     lenses: tuple[Said, Said] = {}, {}
     for key, value in tree.items():
         side = SIDE.fullmatch(_folded(key))
@@ -225,7 +224,7 @@ def _numbers(name: str, value: Any, expected: str, *counts: int) -> Floats:
 
 
 def _is_fisheye(said: Said) -> bool:
-    """Return whether the file names OpenCV's fisheye model; CameraError for a model that is not known."""
+    """Return whether the file names OpenCV's fisheye model; CameraError for an unknown model."""
     key, model = said.get("distortion_model", ("", ""))
     if str(model) not in FISHEYE:
         raise camera_error(key, f"one of {', '.join(FISHEYE)}", short(model), "calibrate with one of these")

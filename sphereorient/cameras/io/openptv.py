@@ -22,13 +22,13 @@ from sphereorient.errors import CameraError
 from sphereorient.files.whole_file import TEXT_BYTES, read_text
 from sphereorient.files.yaml_file import read_yaml, short
 
-# How many numbers each file has, and which.
+# Number and names of the values in each file.
 ORI = 21, "centre, angles, matrix, xh yh cc, glass vector"
 ADDPAR = 7, "k1 k2 k3 p1 p2 scx she"
 PAR = 12, "hp_flag allCam_flag tiff_flag imx imy pix_x pix_y chfield n1 n2 n3 d after the cameras' names"
 YAML_KEYS = ("imx", "imy", "pix_x", "pix_y", "chfield", "mmp_n1", "mmp_n2", "mmp_n3", "mmp_d")
-MOST_NAMES = 4  # cameras whose names older programs write, however many there are
-NO_ADDPAR = [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]  # OpenPTV's defaults where there is no file
+MOST_NAMES = 4  # camera names in files of older programs, whatever the number of cameras
+NO_ADDPAR = [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]  # OpenPTV's defaults without the file
 AXES = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # OpenPTV's camera components to ours
 
 
@@ -45,8 +45,8 @@ class PtvPar:
 
 
 def load_openptv(ori: Path | str, par: PtvPar, addpar: Path | str | None = None) -> Camera:
-    """Read a camera from .ori and .addpar (None: no distortion), behind a port where the media refract.
-    The lab is OpenPTV's world, mm; as in OpenPTV, the angles of the .ori file count, not its matrix.
+    """Read a camera from .ori and .addpar (None: no distortion), behind a port if the media refract.
+    The lab is OpenPTV's world, mm; as in OpenPTV, the angles of the .ori file are used, not its matrix.
     Source: OpenPTV's read_ori; dm = Rx(omega) Ry(phi) Rz(kappa), R_cam_lab = diag(1, -1, -1) dm^T. Raises CameraError
     (a missing, truncated or malformed file, or impossible parameters).
     """
@@ -54,7 +54,7 @@ def load_openptv(ori: Path | str, par: PtvPar, addpar: Path | str | None = None)
     centre, angles, (xh, yh, cc), glass = v[:3], v[3:6], v[15:18], v[18:21]
     *k_p, scx, she = NO_ADDPAR if addpar is None else _numbers(Path(addpar), None, *ADDPAR)
     if scx != 1.0:
-        warnings.warn(f"{addpar}: scx = {scx:g} is read as x' = scx x, y' = y, OpenPTV's classic form.", stacklevel=2)
+        warnings.warn(f"{addpar}: scx = {scx:g} was read as x' = scx x, y' = y, OpenPTV's classic form.", stacklevel=2)
     R_cam_lab = AXES @ so3.from_tait_bryan(_tensor(angles)).mT
     shift_px = _tensor((xh / par.pixel_pitch_mm[0], -yh / par.pixel_pitch_mm[1]))
     with named(str(ori)):
@@ -76,7 +76,7 @@ def load_openptv(ori: Path | str, par: PtvPar, addpar: Path | str | None = None)
 
 
 def load_ptv_par(path: Path | str) -> PtvPar:
-    """Read the sensor and the media from ptv.par, also one with more names than cameras, as older programs write, or
+    """Read the sensor and the media from ptv.par (also with more names than cameras, as older programs write it), or
     from the key ptv of OpenPTV's YAML; CameraError if missing, malformed or interlaced.
     """
     path = Path(path)
@@ -108,7 +108,7 @@ def _port(glass_mm: Sequence[float], par: PtvPar) -> Port:
     vector = _tensor(glass_mm)
     distance = vector.norm()
     if float(distance) == 0:
-        do = "write the wall's normal, as long as the wall's liquid side is away from the origin"
+        do = "write the wall's normal; its length is the distance of the wall's liquid side from the origin"
         raise camera_error("glass vector", "a vector longer than 0", "0 0 0", do)
     return Port(
         normal=vector / distance,

@@ -1,4 +1,4 @@
-"""Whether the cameras see one sphere at one position, and which views of it are studied."""
+"""Whether the cameras see one sphere at one position, and which poses are used to estimate the appearance."""
 
 import math
 from collections.abc import Sequence
@@ -21,33 +21,33 @@ from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.poses import FittedPoses, Poses, PoseStart, best_poses, pose_table
 
 TRIED = 6  # frames
-APART_GAIN = 1.5  # cameras that leave this many times more unexplained together than alone are followed one by one
-APART_PX = 0.4  # a larger distance of lines of sight: estimate light from each camera alone
-FAR_APART_PX = 1.5  # and by more than this, no pose fits all cameras
-FEWEST_BOTH = 4  # frames of two cameras from which their usual disagreement is measured
+APART_GAIN = 1.5  # cameras whose unexplained variance together is this many times that alone are tracked separately
+APART_PX = 0.4  # distance of lines of sight from which light is estimated from each camera alone
+FAR_APART_PX = 1.5  # distance from which no pose fits all cameras
+FEWEST_BOTH = 4  # least number of frames of two cameras for their usual disagreement
 TORN = (Reason.OUTLINE, Reason.LOW_SCORE)  # a camera that sees the sphere elsewhere than the other
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ProvenPoses:
-    """The B poses that are studied, and whether the cameras agree; made by `agreeing_poses`."""
+    """The B poses used to estimate the appearance, and whether the cameras agree."""
 
-    found: Sequence[Poses]  # of all frames: of all cameras together, or of each alone, one camera after the other
+    found: Sequence[Poses]  # of all frames: all cameras together, or each alone, one camera after the other
     frame: list[int]  # of each of the B poses
     poses: tuple[Tensor, Tensor, Tensor]  # positions (B, 3), lab, mm, rotations (B, 3, 3) and use (B, C)
-    camera: list[int] | None = None  # of each of the B poses, where each camera is studied alone
+    camera: list[int] | None = None  # of each of the B poses, if each camera is used alone
     together: bool = True  # whether the cameras see the sphere at one position
 
     @property
     def rows(self) -> list[int]:
-        """Where the B poses stand in `found`."""
+        """Indices of the B poses in `found`."""
         if self.camera is None:
             return self.frame
         frames = len(self.found) // self.poses[2].shape[1]
         return [camera * frames + frame for frame, camera in zip(self.frame, self.camera, strict=True)]
 
     def majority(self, fitter: Fitter, fit: FittedPoses) -> tuple[int, ...]:
-        """Return the cameras that agree where these are more than half of more than two; `fit`: of the B poses."""
+        """Return the cameras that agree if they are more than half of at least three; `fit`: of the B poses."""
         if self.together or self.camera is None:
             return ()
         parts = []
@@ -73,11 +73,11 @@ def proven_poses(found: Sequence[Poses]) -> ProvenPoses:
 
 
 def agreeing_poses(search: Initialiser, frames: Sequence[Sequence[Frame]], found: Sequence[Poses]) -> ProvenPoses:
-    """Return the proven poses of n frames: of all cameras together, or of each alone where they disagree, or prove
-    hardly any frame together, since a pose between those of disagreeing cameras would give a wrong light.
+    """Return the proven poses of n frames: of all cameras together, or of each alone if they disagree or prove hardly
+    any frame together. A pose between disagreeing cameras would give a wrong light.
 
     Raises:
-        ExperimentError: no pose is proven, or cameras contradict each other so that nothing can be measured.
+        ExperimentError: no pose is proven, or the cameras contradict each other too much for any measurement.
     """
     fitter = search.fitter
     if len(fitter.views) == 1 and not proven(found):
@@ -104,8 +104,8 @@ def agreeing_poses(search: Initialiser, frames: Sequence[Sequence[Frame]], found
 
 
 def _check_cameras(fitter: Fitter, alone: Sequence[Sequence[Poses]]) -> None:
-    """Raise ExperimentError if the cameras contradict each other in a way that nothing can be measured, and no majority
-    agrees; `alone`: poses by camera and frame.
+    """Raise ExperimentError if the cameras contradict each other too much for any measurement, and no majority agrees;
+    `alone`: poses by camera and frame.
     """
     parts = []
     for of_camera in alone:
@@ -122,7 +122,7 @@ def _check_cameras(fitter: Fitter, alone: Sequence[Sequence[Poses]]) -> None:
 
 
 def _seen_alone(fitter: Fitter, position_lab_mm: Tensor, R_lab_body: Tensor) -> Seen:
-    """Return poses (N, C, 3), (N, C, 3, 3) of each camera alone as what they say of the pictures."""
+    """Return poses (N, C, 3), (N, C, 3, 3) of each camera alone as observations in its pictures."""
     views = list(enumerate(fitter.views))
     return Seen(
         cameras={view.name: view.camera for view in fitter.views},
@@ -144,8 +144,8 @@ def usual_apart_rad(fit: FittedPoses, use: Tensor) -> float:
 
 
 def limb_px(fitter: Fitter, fit: FittedPoses, use: Tensor) -> Tensor:
-    """Return by how much the limb lies outside of where all cameras together place it, (C,), px: the median of B poses.
-    A wrong diameter, glare, or glass that the cameras' model lacks. 0 where fewer than `FEWEST_BOTH` poses tell.
+    """Return the outward error of the limb against its position by all cameras, (C,), px: the median of B poses.
+    Causes: wrong diameter, glare, glass missing in the camera model. 0 with fewer than `FEWEST_BOTH` poses.
     """
     found = torch.zeros(len(fitter.views), dtype=torch.float64)
     for k, view in enumerate(fitter.views):
@@ -160,18 +160,18 @@ def limb_px(fitter: Fitter, fit: FittedPoses, use: Tensor) -> Tensor:
 def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequence[Poses]) -> tuple[float, float]:
     """Measure on a few frames whether the cameras see one sphere at one position.
     Return, for the worst quarter of frames, the unexplained variance of all cameras together over that of each alone,
-    and the distance between the lines of sight, px. The first is 1 where the cameras differ by less than `APART_PX` in
-    lines of sight, rotation and size, px of the picture: alone, each camera fits what its model lacks as well.
-    Rotations that differ by less than their own errors do not count: a small disk shows little.
+    and the distance between the lines of sight, px. The first is 1 if the cameras differ by less than `APART_PX` (px of
+    the picture) in lines of sight, rotation and size: alone, each camera also fits the errors of its model. Rotations
+    that differ by less than their errors are ignored: a small disk determines them poorly.
     """
     cameras = len(fitter.views)
     sure = proven(found)
-    if not sure:  # wrong cameras spoil every pose of all pictures
+    if not sure:  # wrong cameras spoil every joint pose
         return math.inf, math.inf
     whole = [k for k in sure if bool(found[k].use.all())]
     showing = {k: _showing(fitter, found[k]) for k in sure}
     torn = [any(why in TORN for why in compress(found[k].reason, shown)) for k, shown in showing.items()]
-    if len(whole) < sum(torn):  # a camera that should show it sees it elsewhere, or nothing
+    if len(whole) < sum(torn):  # a camera that should see it sees it elsewhere or not at all
         return math.inf, math.inf
     if cameras == 1 or not whole:
         return 1.0, 0.0
@@ -201,7 +201,7 @@ def _apart(fitter: Fitter, pictures: Sequence[Sequence[Picture]], found: Sequenc
     for (one_camera, X, _), (_, Y, _) in permutations(alone, 2):
         centre = perspective_centre_lab_mm(one_camera, X)
         sight = torch.nn.functional.normalize(X - centre, dim=-1)
-        # The other camera knows the distance by its line of sight; this one by the size of its picture.
+        # Distance by the other camera's line of sight, and by the size of this camera's picture.
         others_px.append((((Y - X) * sight).sum(-1) / (X - centre).norm(dim=-1)).abs() * radius_px)
     differ_px = float(torch.stack([gap_px, *others_px]).amax(0).quantile(0.75))
     gain = float(torch.stack(gains).amax(0).quantile(0.75)) if differ_px > APART_PX else 1.0

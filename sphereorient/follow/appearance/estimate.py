@@ -1,4 +1,4 @@
-"""What is known of a movie's pictures before it is tracked: presence, agreement, light, blur, worn paint, exposure."""
+"""Estimation of the appearance before tracking: presence, agreement, light, blur, worn paint, exposure."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -35,8 +35,8 @@ from sphereorient.pose.lights.kinds import lit_in_the_lab
 from sphereorient.pose.poses import Poses
 from sphereorient.sphere.texture_table import TextureTable
 
-BLUR_FAR_OFF = 0.1  # relative error of the first guess of the blur beyond which its poses are not used
-WIDER = 1.02  # how much larger than in the frames looked at a disk may be in others
+BLUR_FAR_OFF = 0.1  # relative error of the first blur above which its poses are not used
+WIDER = 1.02  # ratio of the largest disk of all frames to that of the sampled frames
 
 
 def estimate_appearance(
@@ -47,11 +47,10 @@ def estimate_appearance(
     following: Following | None = None,
     among: Among | None = None,
 ) -> Appearance:
-    """Estimate light, blur (unless the settings give it) and noise from n x C frames spread over the movies.
-    `first` finds poses with an assumed blur and light; `base` is the finest table of the texture. Without `following`
-    the motion while the shutter is open counts as blur. `among`: of several balls, with poses that are known; then
-    cameras that see another ball do not disagree.
-    Raises ExperimentError: no frame has a pose, or none is better than wrong poses.
+    """Estimate light, blur (unless the settings give it) and noise from n x C frames spread over the movies. `first`
+    finds poses with an assumed blur and light; `base` is the finest table of the texture. Without `following`, motion
+    during the exposure counts as blur. `among`: known poses of several balls; then cameras that see another ball do not
+    disagree. Raises ExperimentError: no frame has a pose, or none is better than wrong poses.
     """
     search, found, sample, odds = _chosen(for_blur(first), frames, among)
     given = settings.blur_px is not None
@@ -61,11 +60,11 @@ def estimate_appearance(
     studied, coded = with_response(studied, given=given)
     search = replace(search, fitter=replace(search.fitter, views=studied.fitter.views))
     if not given and (matched := _matched(search, studied)) is not None:
-        # Poses found with a wrong blur and light learnt at them support each other: both anew, with the blur known.
-        with suppress(ExperimentError):  # where that finds nothing, these poses may still be right
+        # Poses from a wrong blur and light learnt at them support each other: repeat both with the estimated blur.
+        with suppress(ExperimentError):  # if nothing is found, the first poses may still be right
             known = settings.model_copy(update={"blur_px": matched.fitter.optics.blur_px})
             return estimate_appearance(matched, frames, base, known, following, among)
-    # Light learnt at wrong poses explains them as well: what counts is what the map explained before.
+    # Light learnt at wrong poses explains them too: use what the map explained before.
     best, wrong = explained(sample.found, sample.rows)
     studied, worn = without_worn(studied, given=given) if settings.learn_paint else (studied, None)
     still, sharper = studied, False
@@ -77,12 +76,12 @@ def estimate_appearance(
     studied = without_occluders(replace(studied, fitter=fitter, fit=fit))
     score_min = _score_min(studied, still.right_score if moves else studied.right_score, best, wrong)
     sure = [frames[k] for k in proven(found)] if among is None else []
-    alone = among is None and sample.camera is None  # a ball, and all cameras together
+    alone = among is None and sample.camera is None  # one ball, all cameras together
     views = with_least_merit(search, sure, sample.poses[2]) if alone else studied.fitter.views
     fitter, fit, use = studied.fitter, studied.fit, studied.use
     most_px = WIDER * float(fitter.disks_px(fit.position_lab_mm).largest_px.max())
     fitter = replace(fitter, views=views, widest_px=most_px, limb_px=limb_px(fitter, fit, use))
-    # Sought in all pixels: an occluder moves on, a highlight that the light lacks stays.
+    # Search all pixels: an occluder moves, a highlight missing in the light does not.
     lasting = lasting_errors(studied.pixels, fit, use, fitter.model(), with_more_blur(studied) if coded else None)
     return Appearance(
         fitter=fitter,
@@ -103,11 +102,11 @@ def estimate_appearance(
 def _chosen(
     search: Initialiser, frames: Sequence[Sequence[Frame]], among: Among | None
 ) -> tuple[Initialiser, list[Poses], ProvenPoses, float | None]:
-    """Return the search, the poses of all frames, those of them that are studied, and the map's log odds, None where
+    """Return the search, the poses of all frames, the poses used for the estimate, and the map's log odds, None if
     there are more than a few frames.
 
     Raises:
-        ExperimentError: chance, or the map's mirror image, explains as much of the few frames or of those proven.
+        ExperimentError: chance, or the map's mirror image, explains as much of the few frames or of the proven ones.
     """
     search, found = find_poses(search, frames) if among is None else (search, list(among.found))
     sure, few, log_odds = proven(found), len(frames) <= FEW, None
@@ -122,9 +121,7 @@ def _chosen(
 
 
 def _matched(search: Initialiser, studied: Studied) -> Initialiser | None:
-    """Return a search with the blur that was found where the first guess is far from it; None where it is not, or the
-    motion while the shutter is open is taken for blur.
-    """
+    """Return a search with the blur that was found; None if the first guess was near, or blur holds the motion."""
     fitter, blur_px = search.fitter, studied.fitter.optics.blur_px
     if abs(blur_px / fitter.optics.blur_px - 1) <= BLUR_FAR_OFF or darkest_white(studied.fitter) is not None:
         return None
@@ -132,14 +129,14 @@ def _matched(search: Initialiser, studied: Studied) -> Initialiser | None:
 
 
 def _score_min(studied: Studied, still: float, best: float, wrong: float) -> float:
-    """Return the score between wrong and right poses. `still`: the typical one without the motion in the exposure, with
-    which frames are searched; `best` and `wrong`: what the map explained before the light was known.
+    """Return the score between wrong and right poses. `still`: the typical one with the sphere rendered at rest, as in
+    a search; `best` and `wrong`: explained by the map before the light was known.
     """
     right = studied.right_score
     if right < wrong + NO_BETTER:
-        # Dirt or a hidden rim spoils the estimated light: all poses are explained worse than before.
+        # Dirt or a hidden rim spoils the estimated light: all poses explain less than before.
         wrong = right - (best - wrong)
     least = min(right, still)
     score_min = 0.5 * (least + min(wrong, least))
-    # Out of focus wrong poses explain nearly as much.
+    # Out of focus, wrong poses explain nearly as much.
     return min(score_min, clear_of(right)) if soft(studied.fitter) else score_min

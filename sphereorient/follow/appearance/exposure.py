@@ -1,4 +1,4 @@
-"""How far the ball moves while the shutter is open, and the instants of it that are rendered."""
+"""The motion of the ball during the exposure, and the instants at which it is rendered."""
 
 import math
 from collections.abc import Sequence
@@ -17,17 +17,17 @@ from sphereorient.pose.fitter import Fitter
 from sphereorient.pose.neighbours import Neighbours
 from sphereorient.pose.poses import PoseStart, best_poses
 
-LITTLE_MOTION = 0.25  # share of the blur's variance that motion adds while the shutter is open; less counts as blur
-MOST_KNOWN = 0.7  # of the studied frames, whose motion must be measured
-MORE_LEFT = 0.05  # of the variance: by as much more is left where the exposure is certainly another one
-APART_BLURS, MOST_INSTANTS = 3.0, 8  # between neighbouring instants of the exposure, and of these
+LITTLE_MOTION = 0.25  # share of the blur's variance due to motion during the exposure; less counts as blur
+MOST_KNOWN = 0.7  # least share of the frames with measured motion
+MORE_LEFT = 0.05  # increase of the unexplained variance that proves a wrong exposure
+APART_BLURS, MOST_INSTANTS = 3.0, 8  # distance of neighbouring instants of the exposure; their greatest number
 
 
 def with_motion(
     studied: Studied, search: Initialiser, rows: Sequence[int], following: Following, others: Neighbours | None
 ) -> tuple[Studied, bool]:
-    """Render the motion of B poses, those of frames `rows`, while the shutter is open, with the blur that is left,
-    where that explains more; return also whether the pictures are sharper than this motion allows.
+    """Render the motion of B poses, of frames `rows`, during the exposure, with the rest of the blur, if that explains
+    more; return also whether the pictures are sharper than this motion allows.
     """
     open_, moved = _exposed(studied, search, rows, following, others)
     if moved is None:
@@ -42,9 +42,9 @@ def with_motion(
 def _exposed(
     studied: Studied, search: Initialiser, rows: Sequence[int], following: Following, others: Neighbours | None
 ) -> tuple[Fitter, Tensor | None]:
-    """Return a fitter that renders as many instants of the exposure as B poses need, with the blur that is left of the
-    paint, and their turn and move (B, 6) while the shutter is open, NaN where it is not known; None, and the same
-    fitter, where it hardly blurs the pictures. `others`: of the B poses, about where they are in the frames beside.
+    """Return a fitter that renders as many instants of the exposure as B poses need, with the rest of the paint's blur,
+    and their rotation and displacement (B, 6) during the exposure, NaN if unknown. If motion hardly blurs the pictures:
+    the same fitter, and None. `others`: neighbours of the B poses, also for the frames next to them.
     """
     fitter, fit, use = studied.fitter, studied.fit, studied.use
     search = replace(search, fitter=fitter)
@@ -66,7 +66,7 @@ def _exposed(
             return torch.where(right[:, None], share[these, None] * way, torch.nan)
 
         way = from_poses(torch.arange(len(some)), before.position_lab_mm, before.R_lab_body)
-        # Of a ball that turns far between frames the next pose has to be searched for.
+        # If the ball rotates far between frames, the next pose must be searched.
         lost = [k for k in torch.nonzero(way.isnan().any(1))[:, 0].tolist() if others is None and bool(usable[k].all())]
         found = dict(zip(lost, search.all_poses([frames[k] for k in lost]), strict=True))
         again = torch.tensor([k for k in lost if len(found[k])], dtype=torch.int64)
@@ -93,7 +93,7 @@ def _exposed(
     width_px = smear_px(every, moved)
     if float(width_px.isfinite().double().mean()) < MOST_KNOWN:
         return fitter, None
-    # What is left of the blur once the motion is taken out sets how far apart instants may be.
+    # The blur without the motion sets the distance of the instants.
     left_px = math.sqrt(max(blur_px**2 - float(width_px.square().nanmean()) / 12, FINEST_PX**2))
     instants = 1 + math.ceil(float(width_px.nanquantile(0.9)) / (APART_BLURS * left_px))
     fitter = fitter.with_blur(studied.paint, left_px)

@@ -23,22 +23,22 @@ from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.sphere.texture_table import TextureTable
 
-CALM_PX = 1.0  # blur that is laid over pictures first, against noise
+CALM_PX = 1.0  # blur added to pictures first, against noise
 AROUND = 1.2  # of the radius: the sphere and its rim
 CONTRAST = (2.5, 97.5)  # percentiles between which the grey levels of paint and scene lie
-STEEPEST = 99.5  # percentile of the slopes: few pixels lie on an edge
-FINER, FINEST = 1.25, 1.07  # ratio of the blurs that are tried, at first and once it is nearly known
-WIDEST = 0.3  # of the radius: wider ones remove all paint
-BLUR_ROUNDS = 4  # of blur and light in turn, at most
-BLUR_STAYS = 0.03  # relative change of the blur within which light and blur agree
-LIMB_ROUNDS, LIMB_STAYS = 4, 0.005  # the same of the limb's blur
-MOST_WIDER = 1.25  # ratio by which a round may change the limb's blur: the step is linear
+STEEPEST = 99.5  # percentile of the slopes, as few pixels lie on an edge
+FINER, FINEST = 1.25, 1.07  # ratio of the tried blurs, at first and when it is nearly known
+WIDEST = 0.3  # of the radius: a wider blur removes all paint
+BLUR_ROUNDS = 4  # most rounds of blur and light by turns
+BLUR_STAYS = 0.03  # relative change of the blur at convergence
+LIMB_ROUNDS, LIMB_STAYS = 4, 0.005  # the same for the limb's blur
+MOST_WIDER = 1.25  # greatest ratio of the limb's blurs of two rounds, as the step is linear
 
 
 def estimate_blur_px(disks: Iterable[tuple[NDArray[np.generic], Outline]]) -> float:
-    """Return the standard deviation of the blur, px, of the steepest edges of disks in pictures: the median.
-    A first guess, biased by noise and paint without edges. 0 without disks.
-    Source: a step of height h under a Gaussian blur sigma is h / (sigma sqrt(2 pi)) steep at most.
+    """Return the standard deviation of the blur, px, from the steepest edges of disks in pictures: the median.
+    A first guess, biased by noise and by paint without edges. 0 without disks.
+    Source: the slope of a step of height h under a Gaussian blur sigma is at most h / (sigma sqrt(2 pi)).
     """
     found = []
     for picture, disk in disks:
@@ -48,7 +48,7 @@ def estimate_blur_px(disks: Iterable[tuple[NDArray[np.generic], Outline]]) -> fl
 
 
 def steepest_blur_px(picture: NDArray[np.float32]) -> float:
-    """Return the standard deviation of the blur, px, of the steepest edge between the darkest and the brightest."""
+    """Return the standard deviation of the blur, px, at the steepest edge between darkest and brightest level."""
     calm = cv2.GaussianBlur(picture, (0, 0), CALM_PX)
     slope = np.hypot(cv2.Scharr(calm, cv2.CV_32F, 1, 0), cv2.Scharr(calm, cv2.CV_32F, 0, 1)) / 32
     low, high = np.percentile(calm, CONTRAST)
@@ -60,7 +60,7 @@ def steepest_blur_px(picture: NDArray[np.float32]) -> float:
 def best_blur_px(
     fitter: Fitter, base: TextureTable, pixels: Pixels, fit: FittedPoses, use: Tensor, ratio: float
 ) -> float:
-    """Return the blur that leaves the least variance unexplained, interpolated between tried ones, `ratio` apart."""
+    """Return the blur with the least unexplained variance, interpolated between tried ones, `ratio` apart."""
     radius_px, now_px = widest_px(fitter.views) / 2, fitter.optics.blur_px
     most_px = max(WIDEST * radius_px, FINEST_PX * FINER**7)
     fewest, most = (math.log(end / now_px) / math.log(ratio) for end in (FINEST_PX, most_px))
@@ -70,7 +70,7 @@ def best_blur_px(
     def unexplained(k: int) -> float:
         return fitter.left(pixels, fit, use, level_of(base, now_px * ratio**k, 0.0, radius_px), 2)
 
-    # Downhill from the blur that is known: each table of the paint costs a tenth of a second.
+    # Downhill from the known blur: each table of the paint takes a tenth of a second.
     best, k = min(max(0, fewest), most), None
     while best != k:
         k = best
@@ -84,11 +84,11 @@ def best_blur_px(
 
 
 def light_and_blur(studied: Studied, *, given: bool) -> Studied:
-    """Estimate light, then blur unless it is `given`, then light again, until the blur stays.
-    Where the first guess of the blur is far off, one round is not enough.
+    """Estimate light, then blur unless it is `given`, then light again, until the blur converges.
+    One round does not suffice if the first blur is far off.
     """
     studied = studied.lit()
-    slow = soft(studied.fitter)  # there each round moves the blur by little
+    slow = soft(studied.fitter)  # each round changes such a blur by little
     for done in range(1 if given else BLUR_ROUNDS):
         before_px = studied.fitter.optics.blur_px
         if not given:
@@ -102,7 +102,7 @@ def light_and_blur(studied: Studied, *, given: bool) -> Studied:
 
 
 def _limb_blurred(studied: Studied) -> Studied:
-    """Estimate the blur of the limb: one that is too narrow moves the ball to its bright side."""
+    """Estimate the blur of the limb: too narrow a limb shifts the ball to its bright side."""
     for _ in range(LIMB_ROUNDS):
         fitter = studied.fitter
         before_px = fitter.optics.limb_blur_px
@@ -116,22 +116,20 @@ def _limb_blurred(studied: Studied) -> Studied:
 
 
 def darkest_white(fitter: Fitter) -> str | None:
-    """Return the camera that shows what the map calls white darkest, if it is darker than what it calls black."""
+    """Return the camera in which white paint of the map is darkest, if it is darker than black paint."""
     contrast = fitter.light.tables.cells[:, 0].reshape(len(fitter.views), -1).mean(1)
     return fitter.views[int(contrast.argmin())].name if bool((contrast < 0).any()) else None
 
 
 def check_white(fitter: Fitter) -> None:
-    """Raise ExperimentError where a camera shows what the map calls white darker than what it calls black."""
+    """Raise ExperimentError if a camera shows white paint of the map darker than black."""
     if (inverted := darkest_white(fitter)) is not None:
         got, do = f"white paint darker than black in {inverted}", "exchange black and white of the map"
         raise ExperimentError(refusal("sphere.texture", expected="a map whose white is bright", got=got, do=do))
 
 
 def without_occluders(studied: Studied) -> Studied:
-    """Estimate light and poses without what covers the ball, or let the fitter look for nothing that does where most of
-    the ball is hidden in most pictures.
-    """
+    """Estimate light and poses without occluders; if most of the ball is usually hidden, seek no occluders."""
     fitter, fit, use = studied.fitter, studied.fit, studied.use
     free = enough_of(fitter.unoccluded(studied.whole, fit.position_lab_mm, fit.R_lab_body))
     hidden = 1.0 - free.inside.sum(-1) / studied.pixels.inside.sum(-1).clamp_min(1)

@@ -1,4 +1,4 @@
-"""Whether a few pictures show the map: what it explains of them against what it explains of their mirror images."""
+"""Whether a few pictures show the map: its score compared with the score of the mirrored pictures."""
 
 import math
 from collections.abc import Sequence
@@ -18,32 +18,30 @@ from sphereorient.pose.camera_view import Picture
 from sphereorient.pose.fitter import LEAST_LEFT
 from sphereorient.pose.poses import Poses
 
-FEW = 8  # frames; more of them tell by their own wrong poses, see `explained`
-VIEWS = 50.0  # independent ones of a paint: so odds are right for 191 stills of balls with other maps
-CHANCE, BEYOND_CHANCE = 0.25, 0.85  # least and greatest score that the best pose of a wrong map is taken to have
-LEAST_ODDS = 4.0  # of the map; 191 right ones: 5 or more
-SURE_ODDS = 20.0  # of the mirror image, to name it
-MOST = math.log(1e6)  # log odds of one picture; the model is no better
-RIM_PX = 3.0  # beyond the limb, mirrored with the disk
+FEW = 8  # frames; for more, wrong poses are compared instead, see `explained`
+VIEWS = 50.0  # independent views of a paint; calibrated on 191 stills of balls with other maps
+CHANCE, BEYOND_CHANCE = 0.25, 0.85  # least and greatest assumed score of the best pose of a wrong map
+LEAST_ODDS = 4.0  # of the map; 191 right maps had 5 or more
+SURE_ODDS = 20.0  # of the mirror image, from which it is reported
+MOST = math.log(1e6)  # log odds of one picture, limited by the errors of the model
+RIM_PX = 3.0  # outside the limb, mirrored with the disk
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapOdds:
-    """Scores of a map in n pictures of each of C cameras; made by `map_odds`."""
+    """Scores of a map in n pictures of each of C cameras."""
 
-    score: Tensor  # (n, C), of the best pose; NaN: no disk to look at
+    score: Tensor  # (n, C), of the best pose; NaN: no disk
     mirrored: Tensor  # (n, C), of the best pose in the mirrored picture
 
     @property
     def log_odds(self) -> Tensor:
-        """Logarithm of the odds (C,) of the map against a wrong one, which explains as much as its mirror image."""
+        """Logarithm of the odds (C,) of the map against a wrong map, which explains as much as its mirror image."""
         likelier = pose_log_odds(self.score, self.mirrored, BEYOND_CHANCE) - pose_log_odds(self.mirrored, self.score)
         return likelier.nan_to_num(0.0).sum(0)
 
     def check(self, cameras: Sequence[str], *, found: bool) -> None:
-        """Raise ExperimentError where the map's mirror image is likelier, or, if poses were `found`, chance explains
-        as much.
-        """
+        """Raise ExperimentError if the mirror image is likelier or, with poses `found`, chance explains as much."""
         odds, scores = self.log_odds, [_percent(one) for one in (self.score, self.mirrored)]
         both = zip(cameras, *scores, strict=True)
         got = "a map that explains " + ", ".join(
@@ -52,7 +50,7 @@ class MapOdds:
         if wrong := [name for name, one in zip(cameras, odds.tolist(), strict=True) if one < -math.log(SURE_ODDS)]:
             got += f": odds of {_odds_words(-odds.min())} that it is mirrored"
             flip = ", ".join(f"{name}: horizontal" for name in wrong)
-            do = f"write flip: {{{flip}}}, remove one that is there, or correct a map that is mirrored or upside down"
+            do = f"write flip: {{{flip}}}, remove an existing one, or correct a map that is mirrored or upside down"
             raise ExperimentError(refusal("movies", expected="pictures that are not mirrored", got=got, do=do))
         if found and float(odds.sum()) < math.log(LEAST_ODDS):
             got += f": odds of {_odds_words(odds.sum())} against chance"
@@ -61,10 +59,9 @@ class MapOdds:
 
 
 def pose_log_odds(score: Tensor, other: Tensor, greatest: float = 1.0) -> Tensor:
-    """Return the logarithm of the odds (...), 1 to 1 at least, of a pose against another one, by their scores; a wrong
-    pose has a score of `greatest` at most.
-    The best of N independent views of a wrong map leaves the share V of the variance, with V ** (-n / 2) = N of n
-    independent pixels. A pose that leaves U has the odds (V / U) ** (n / 2) = N ** (log U / log V - 1).
+    """Return the log odds (...), at least 0, of a pose against another one, by their scores; `greatest`: most a wrong
+    pose reaches. The best of N independent views of a wrong map leaves the share V of the variance, with V ** (-n / 2)
+    = N for n independent pixels. A pose that leaves U has the odds (V / U) ** (n / 2) = N ** (log U / log V - 1).
     """
     gain, chance = (
         -(1 - one.clamp(CHANCE, most)).clamp_min(LEAST_LEFT).log() for one, most in ((score, 1.0), (other, greatest))
@@ -74,9 +71,9 @@ def pose_log_odds(score: Tensor, other: Tensor, greatest: float = 1.0) -> Tensor
 
 
 def map_odds(search: Initialiser, frames: Sequence[Sequence[Frame]], found: Sequence[Poses], *, only: bool) -> MapOdds:
-    """Compare what the map explains of n x C pictures at their best poses with what it explains when they are mirrored.
-    `only`: of an only ball the outline says where several cameras see it, since one that is mirrored spoils the pose of
-    all; without a pose it always does.
+    """Compare the scores of the map in n x C pictures at their best poses with those in the mirrored pictures.
+    `only`: a single ball is located by its outline if there are several cameras, since one mirrored movie spoils the
+    joint pose; without a pose, always by the outline.
     """
     views, radius_mm = search.fitter.views, search.fitter.radius_mm
     alone = [replace(search, fitter=search.fitter.of(k), known=None, least=0.0) for k in range(len(views))]
@@ -113,7 +110,7 @@ def _best_score(alone: Initialiser, picture: Picture, disk: Outline) -> float:
 
 
 def _mirrored(picture: Picture, disk: Outline) -> tuple[Picture, Outline]:
-    """Return a picture (H, W) whose disk is mirrored left to right, and the outline there, half a pixel off at most."""
+    """Return a picture (H, W) whose disk is mirrored left to right, and its outline there, at most half a pixel off."""
     height, width = picture.shape
     v, u = np.arange(height)[:, None], np.arange(width)
     inside = np.hypot(u - disk.u_px, v - disk.v_px) < disk.radius_px + RIM_PX

@@ -1,4 +1,4 @@
-"""Which frames show the ball: poses of all that are studied, and whether the map explains them better than chance."""
+"""Which frames show the ball: poses of all sampled frames, and whether the map explains them better than chance."""
 
 import math
 from collections.abc import Sequence
@@ -16,21 +16,21 @@ from sphereorient.pose.camera_view import CameraView
 from sphereorient.pose.fitter import LEAST_LEFT, Fitter
 from sphereorient.pose.poses import Poses, PoseStart, poses_of
 
-BETTER = 0.1  # by which the score of a proven pose exceeds that of wrong ones
-NO_BETTER = 0.05  # reject the map if its best score exceeds that of wrong poses by less than this
-TELLING = 2.0  # unless wrong poses leave this many times more unexplained, picture by picture; other maps: 1.6 at most
+BETTER = 0.1  # least excess of a proven pose's score over that of wrong poses
+NO_BETTER = 0.05  # the map is refused if its best score exceeds that of wrong poses by less than this
+TELLING = 2.0  # unless wrong poses have this many times the unexplained variance per picture; wrong maps: 1.6 at most
 LOOK_ALIKE = "look with `sphereorient check`: another map, a mirrored movie (flip:) or swapped cameras look like this"
-SELDOM = 0.25  # share of the frames with poses; fewer proven ones may be chance
-RIVALS = 0.1  # share of the frames with two claimants, two frames at least: there is a second ball
+SELDOM = 0.25  # share of the frames with poses; fewer proven frames may be chance
+RIVALS = 0.1  # share of the frames (two at least) with two disks that fit the map: there is a second ball
 
 
 def for_blur(search: Initialiser) -> Initialiser:
-    """Return a search that trusts no outline of pictures out of focus: the texture locates the sphere."""
+    """Return a search that ignores outlines of pictures out of focus: the texture locates the sphere."""
     return replace(search, score_min=ALWAYS) if soft(search.fitter) else search
 
 
 def find_poses(search: Initialiser, frames: Sequence[Sequence[Frame]]) -> tuple[Initialiser, list[Poses]]:
-    """Find the poses of n frames; return them, and the search: where outlines miss the ball the texture locates it."""
+    """Find the poses of n frames; return them and the search. If outlines miss the ball, the texture locates it."""
     found = _poses_of_all(search, frames)
     if proven(found) or search.score_min >= ALWAYS:
         return search, found
@@ -40,7 +40,7 @@ def find_poses(search: Initialiser, frames: Sequence[Sequence[Frame]]) -> tuple[
 
 def proven(found: Sequence[Poses]) -> list[int]:
     """Return the frames whose best pose explains every picture in use better than wrong poses do, and about as well as
-    in the typical frame of these.
+    in the typical one of these frames.
     """
     best = torch.tensor([float(poses.score[0, poses.use].min()) if len(poses) else -1.0 for poses in found])
     wrong = torch.tensor([float(poses.score[1, poses.use].min()) for poses in found if len(poses) > 1])
@@ -53,7 +53,7 @@ def proven(found: Sequence[Poses]) -> list[int]:
 
 
 def seldom(found: Sequence[Poses]) -> bool:
-    """Return whether so few of the frames with poses are proven that these may be so by chance."""
+    """Return whether so few of the frames with poses are proven that this may be chance."""
     return len(proven(found)) < SELDOM * sum(len(poses) > 0 for poses in found)
 
 
@@ -67,13 +67,13 @@ def explained(found: Sequence[Poses], clear: Sequence[int]) -> tuple[float, floa
     wrong = torch.cat([found[k].score[1:][:, found[k].use].reshape(-1) for k in clear])
     best, highest = float(right.median()), float(wrong.quantile(0.9)) if len(wrong) else 0.0
     if best < highest + NO_BETTER and _times_better(found, clear) < TELLING:
-        got = f"poses that explain {100 * best:.0f} % of the pictures, as wrong ones do"
+        got = f"best poses that explain {100 * best:.0f} % of the pictures, about as much as wrong poses"
         raise ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=LOOK_ALIKE))
     return best, highest
 
 
 def _times_better(found: Sequence[Poses], clear: Sequence[int]) -> float:
-    """Return the median ratio of the variances left by second and best pose; blurred pictures need the ratio."""
+    """Return the median ratio of the unexplained variance of second and best pose; needed for blurred pictures."""
     rows = [(found[k].score[:2], found[k].use) for k in clear if len(found[k]) > 1]
     if not rows:
         return math.inf
@@ -82,7 +82,7 @@ def _times_better(found: Sequence[Poses], clear: Sequence[int]) -> float:
 
 
 def no_sphere_error(found: Sequence[Poses]) -> ExperimentError:
-    """Return the error of a movie without the sphere, or without a pose that fits."""
+    """Return the error for a movie without the sphere or without a fitting pose."""
     reasons = {str(why) for poses in found for why in poses.reason} - {Reason.OK}
     why = f" ({', '.join(sorted(reasons))})" if reasons else ""
     got = f"none in {len(found)} frames looked at{why}"
@@ -94,9 +94,7 @@ def no_sphere_error(found: Sequence[Poses]) -> ExperimentError:
 
 
 def with_least_merit(search: Initialiser, frames: Sequence[Sequence[Frame]], use: Tensor) -> list[CameraView]:
-    """Return the views with the least merit of a blob in which the sphere is looked for; `use` (n, C): which cameras
-    show it in n frames.
-    """
+    """Return the views with the least merit of an examined blob; `use` (n, C): cameras that show the sphere."""
     views = []
     for camera, view in enumerate(search.fitter.views):
         seeing = zip(frames, use[:, camera].tolist(), strict=True)
@@ -106,20 +104,18 @@ def with_least_merit(search: Initialiser, frames: Sequence[Sequence[Frame]], use
 
 
 def second_ball(search: Initialiser, frames: Sequence[Sequence[Frame]], studied: int) -> bool:
-    """Return whether two disks wear the map in so many of these frames, of all that are `studied`, that there is a
-    second ball.
-    """
+    """Return whether so many of the `studied` frames have two disks that fit the map that there are two balls."""
     claimed = sum(count > 1 for count in side_by_side(search.claimants, frames))
     return claimed >= max(2, RIVALS * studied)
 
 
 def _poses_of_all(search: Initialiser, frames: Sequence[Sequence[Frame]]) -> list[Poses]:
-    """Find the poses of n frames, with cameras that see the sphere without an outline."""
+    """Find the poses of n frames, also in cameras that see the sphere without an outline."""
     return [_seen_by_all(search.fitter, *one) for one in zip(frames, search.all_poses(frames), strict=True)]
 
 
 def _seen_by_all(fitter: Fitter, frames: Sequence[Frame], poses: Poses) -> Poses:
-    """Let cameras without an outline count too where one pose explains all pictures: black paint may hide a rim."""
+    """Use cameras without an outline too if one pose explains all pictures: black paint may hide a rim."""
     usable = torch.tensor([shot.usable for shot in frames])
     if not len(poses) or bool((poses.use == usable).all()):
         return poses

@@ -1,4 +1,4 @@
-"""The response of cameras that the experiment does not give, from paint, light and limb together."""
+"""The response of cameras, where the experiment does not give it, from paint, light and limb together."""
 
 import math
 from dataclasses import replace
@@ -12,17 +12,17 @@ from sphereorient.follow.appearance.record import Studied
 from sphereorient.pose.lasting import response_exponents
 from sphereorient.pose.model import SphereModel
 
-ROUNDS, STAYS = 6, 0.01  # rounds of estimation; change of ln gamma from which they end
-MOST = math.log(2.0)  # by which a round may change ln gamma: the step is linear
-MORE = 1.02  # ratio of a blur that is a little more
-CODED = 0.2  # ln gamma from which a response is not linear: gloss that is not modelled looks like 0.08
-SURE = 0.05  # standard deviation of ln gamma up to which pictures tell it; of one photograph it is 0.2
-MOST_CLIPPED = 0.05  # share of a disk's pixels; white that is cut off looks like a gamma of 0.7
+ROUNDS, STAYS = 6, 0.01  # rounds of estimation; change of ln gamma at convergence
+MOST = math.log(2.0)  # largest change of ln gamma in a round, as the step is linear
+MORE = 1.02  # ratio of a slightly wider blur
+CODED = 0.2  # ln gamma from which a response is not linear; unmodelled gloss looks like 0.08
+SURE = 0.05  # greatest standard deviation of a usable ln gamma; one photograph gives 0.2
+MOST_CLIPPED = 0.05  # share of a disk's pixels; clipped white looks like a gamma of 0.7
 
 
 def with_response(studied: Studied, *, given: bool) -> tuple[Studied, bool]:
-    """Estimate gamma of the cameras whose response is not known, with blur and light. Those whose pictures are linear,
-    or do not tell, stay as they are. Return also whether one was learnt. `given`: as in `light_and_blur`.
+    """Estimate gamma of the cameras of unknown response, with blur and light. Cameras with linear pictures, or of
+    uncertain gamma, stay unchanged. Return also whether one was learnt. `given`: as in `light_and_blur`.
     """
     asked = torch.tensor([view.response is None for view in studied.fitter.views]) & ~_clipped(studied)
     gamma, learnt = torch.zeros(len(asked), dtype=torch.float64), studied
@@ -41,20 +41,20 @@ def with_response(studied: Studied, *, given: bool) -> tuple[Studied, bool]:
 
 
 def _clipped(studied: Studied) -> Tensor:
-    """Return the cameras, (C,) bool, whose disks are clipped in many pixels."""
+    """Return the cameras, (C,) bool, with many clipped pixels on their disks."""
     shares = (studied.pixels.clipped & studied.pixels.inside).float().mean(1).reshape(studied.use.shape)
     found: Tensor = (shares * studied.use).sum(0) > MOST_CLIPPED * studied.use.sum(0)
     return found
 
 
 def with_more_blur(studied: Studied) -> SphereModel:
-    """Return the model of paint that is blurred a little more."""
+    """Return the model with slightly more blur of the paint."""
     optics = studied.fitter.optics
     return studied.fitter.with_blur(studied.paint, MORE * optics.blur_px, optics.limb_blur_px).model()
 
 
 def _responding(studied: Studied, gamma: Tensor) -> Studied:
-    """Return the same, so far studied as of linear cameras, with the light of responses ln gamma (C,)."""
+    """Return the estimate with the light of responses ln gamma (C,), instead of linear cameras."""
     views = [
         view if power == 1.0 else replace(view, response=Response(gamma=power))
         for view, power in zip(studied.fitter.views, gamma.exp().tolist(), strict=True)

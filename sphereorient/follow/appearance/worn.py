@@ -1,4 +1,4 @@
-"""Paint that differs from the map: found where the pictures say so in both halves of the movie, and not used."""
+"""Worn paint: found if both halves of the movie show it, and not used."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,27 +14,27 @@ from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses
 from sphereorient.pose.worn import CHANGED, without, worn_cells, worn_share
 
-FEWEST_VIEWS = 8  # rows of poses in which worn paint is looked for
-# By how much paint differs that is not used, round by round: while poses are wrong, so do the borders of right paint.
+FEWEST_VIEWS = 8  # rows of poses needed to find worn paint
+# Least difference of worn paint, by round: with wrong poses, the borders of right paint differ too.
 WORN_ROUNDS = (0.5, 0.5, 0.35, 0.35, 0.25, 0.25, 0.2, 0.2, CHANGED, CHANGED)
-FITS = 3.0  # excess of a fit whose map is right once worn paint is not used: 1.1 to 2.7; of a warped map 4.2
-# By which the logarithm of the variance left must fall where worn paint is not used: 1.3 to 2.8 in balls that have lost
-# 2 to 45 % of their paint, up to 1.1 where the map is warped, and with highlights or a rod.
+FITS = 3.0  # excess of a fit without worn paint: 1.1 to 2.7 with a right map; 4.2 with a warped one
+# Least fall of the log of the unexplained variance without worn paint: 1.3 to 2.8 for balls that have lost 2 to 45 %
+# of their paint; up to 1.1 with a warped map, highlights or a rod.
 WORN_GAIN = 1.2
-FIRST_ROUNDS, FIRST_GAIN = 5, 0.15  # after these rounds it is 0.5 to 2.2 in worn balls, below 0.05 in others
-WORN_SEEN = 0.005  # share of the ball that differs at first sight, below which it is not looked for
-WORN_LEAST = 0.01  # share of the ball; less paint than this moves no pose by as much as its noise
+FIRST_ROUNDS, FIRST_GAIN = 5, 0.15  # after these rounds: 0.5 to 2.2 for worn balls, below 0.05 for others
+WORN_SEEN = 0.005  # least share of the ball that differs at first; below it there is no search
+WORN_LEAST = 0.01  # share of the ball; less worn paint changes poses by less than their noise
 
 
 def without_worn(studied: Studied, *, given: bool) -> tuple[Studied, Tensor | None]:
     """Do not use paint that differs from the map; return also where that is, None: nowhere.
-    Found in one half of the movie, it must leave less in the other half: what differs there, too, turns with the ball.
+    Worn paint found in one half of the movie must reduce the residuals of the other half: it rotates with the ball.
     `given`: as in `light_and_blur`.
     """
     fitter, pixels, fit, use = studied.fitter, studied.pixels, studied.fit, studied.use
-    if len(use) < FEWEST_VIEWS:  # of each patch, to tell paint from light
+    if len(use) < FEWEST_VIEWS:  # of each patch, to distinguish paint from light
         return studied, None
-    # Of a ball that turns little glints take the place of worn paint.
+    # If the ball rotates little, glints absorb worn paint.
     bare = fitter.with_light_of(pixels, fit, use, glints=False)
     if worn_share(worn_cells(pixels, fit, use, bare.model())) < WORN_SEEN:
         return studied, None
@@ -43,7 +43,7 @@ def without_worn(studied: Studied, *, given: bool) -> tuple[Studied, Tensor | No
         now: Fitter, rounds: Sequence[float], pixels: Pixels, fit: FittedPoses, use: Tensor
     ) -> tuple[Fitter, FittedPoses, Tensor | None]:
         worn = None
-        for changed in rounds:  # worn paint bends the light and the poses that it is found with
+        for changed in rounds:  # worn paint biases the light and poses used to find it
             worn = worn_cells(pixels, fit, use, now.model(), changed)
             paint = without(fitter.optics.fine.paint, worn)  # blurred already
             now = now.with_blur(paint, fitter.optics.blur_px, fitter.optics.limb_blur_px)
@@ -63,8 +63,8 @@ def without_worn(studied: Studied, *, given: bool) -> tuple[Studied, Tensor | No
     if gain / 2 < WORN_GAIN:
         return studied, None
     lit, fitted, worn = found(bare, WORN_ROUNDS, pixels, fit, use)
-    wrong = float(fitted.excess[use].median()) > FITS  # the paint that is left is not the map's either
+    wrong = float(fitted.excess[use].median()) > FITS  # the rest of the paint differs from the map too
     if wrong or worn is None or worn_share(worn) < WORN_LEAST:
         return studied, None
     studied = replace(studied, fitter=lit, fit=fitted, paint=without(studied.paint, worn))
-    return light_and_blur(studied, given=given), worn  # the blur, too, was found with worn paint
+    return light_and_blur(studied, given=given), worn  # the blur was estimated with worn paint

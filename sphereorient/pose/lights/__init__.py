@@ -1,1 +1,1 @@
-"""Lights: what every light is (`light`), on the disk (`disk`), in the lab (`lab`); which one a movie has (`kinds`)."""
+"""Lights: on the disk (`disk`), in the lab (`lab`); the choice between them (`kinds`)."""

@@ -1,4 +1,4 @@
-"""Light as maps over the disk of each camera: sums of functions, and glints of lamps that the surface mirrors."""
+"""Light as maps over the disk of each camera: sums of functions, and glints."""
 
 import math
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ from sphereorient.pose.residuals import Residuals, learn_stray, noise_curves
 from sphereorient.so3 import inverse_damped
 from sphereorient.sphere.view import polynomials
 
-MAP_SIDE = 256  # cells of a look-up map across the disk: a third of a pixel of an 80 px disk
+MAP_SIDE = 256  # cells of a look-up map across the disk: a third of a pixel for an 80 px disk
 ORDER, DEPTH_ORDER = 4, 3  # of the polynomials in x, y and of those times the depth sqrt(1 - x^2 - y^2)
 GLINTS = 32  # cells across the disk
 RIDGE = 1e-5  # of light maps, relative to the diagonal
@@ -36,7 +36,7 @@ class DiskLight(Light):
 
     difference: Tensor  # (C, K), of `light_basis`
     black: Tensor  # (C, K)
-    glints: Tensor  # (C, G, G), more of black, over the square about the disk: lamps that the surface mirrors
+    glints: Tensor  # (C, G, G), added to black, over the square about the disk
 
     of_cameras = ("difference", "black", "noise", "stray", "lean", "dark", "glints")
     linear = True
@@ -52,7 +52,7 @@ class DiskLight(Light):
 
     @cached_property
     def _map(self) -> Tensor:
-        """Return difference and black over the square about the disk, (C * S * S, 2): a look-up beats 25 functions."""
+        """Return difference and black over the square about the disk, (C * S * S, 2), for look-up."""
         across, basis = (part.to(self.difference.device) for part in _on_map())
         black = self.black @ basis + glints_at(self.glints, across.mT.expand(len(self.glints), -1, -1))
         return torch.stack([self.difference @ basis, black], dim=-1).reshape(-1, 2)
@@ -79,9 +79,7 @@ class DiskLight(Light):
     def learnt(
         self, pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, *, glints: bool = True
     ) -> "DiskLight":
-        """Estimate light and noise anew; see `Light.learnt`. Each pose may change with the light: a light at given
-        poses favours them, however wrong they are.
-        """
+        """Estimate light and noise anew, with the poses, see `Light.learnt`: fixed poses would be favoured."""
         cameras = use.shape[1]
         at = fitted_residuals(pixels, fit, model)
         stray = learn_stray(at, pixels, use, self.stray)
@@ -91,7 +89,7 @@ class DiskLight(Light):
         columns = torch.cat([at.design[:, :6], light_columns(at.view)], dim=1)
         normal, right = light_sums(columns, at.view, lit, at.weight / at.variance * use.reshape(-1, 1))
         normal, right = by_pose(normal, cameras), by_pose(right, cameras)
-        by_light = normal[..., 6:, :6].flatten(1, 2)  # (B, C 2K, 6): the cameras share the pose
+        by_light = normal[..., 6:, :6].flatten(1, 2)  # (B, C 2K, 6): the pose is common to all cameras
         mixed = by_light @ inverse_damped(normal[..., :6, :6].sum(1))
         each = torch.einsum("cd,cij->cidj", torch.eye(cameras, dtype=torch.float64), normal[..., 6:, 6:].sum(0))
         whole = each.flatten(2, 3).flatten(0, 1) - (mixed @ by_light.mT).sum(0)
@@ -104,7 +102,7 @@ class DiskLight(Light):
 
 
 def light_basis(across: Tensor) -> Tensor:
-    """Return the basis of light maps, (..., K, P): polynomials in the normal's components, which fit grazing lamps."""
+    """Return the basis of light maps, (..., K, P): polynomials in the normal's components."""
     depth = (1.0 - across.square().sum(-2)).clamp_min(0).sqrt()
     return torch.cat([polynomials(across, ORDER), polynomials(across, DEPTH_ORDER) * depth[..., None, :]], dim=-2)
 
@@ -114,13 +112,13 @@ def _on_map() -> tuple[Tensor, Tensor]:
     """Return the places of a look-up map, (2, S * S), radii, and the basis of light maps there."""
     at = (torch.arange(MAP_SIDE, dtype=torch.float32) + 0.5) * (2.0 / MAP_SIDE) - 1.0
     y, x = torch.meshgrid(at, at, indexing="ij")
-    # Cells that the limb cuts take their value on the disk.
+    # Cells cut by the limb get the value inside it.
     across = (torch.stack([x, y]) / torch.hypot(x, y).clamp_min(1.0)).reshape(2, -1)
     return across, light_basis(across)
 
 
 def no_glints(cameras: int) -> Tensor:
-    """Return the glints of a surface that mirrors no lamp."""
+    """Return zero glints."""
     return torch.zeros(cameras, GLINTS, GLINTS)
 
 
@@ -133,9 +131,9 @@ def glints_at(glints: Tensor, across: Tensor) -> Tensor:
 
 
 def learn_glints(at: Residuals, use: Tensor, known: Tensor) -> Tensor:
-    """Estimate what the surface mirrors, (C, G, G), see `Light`, from what B * C disks, those of `use` (B, C), leave
-    in the same cell of the disk, but for its limb; each disk's pose and own light may change with it, else they keep
-    what they took of it. `known` (C, G, G) is the one that the residuals hold.
+    """Estimate the glints (C, G, G), see `Light`, from the residuals that B * C disks, those in `use` (B, C), have in
+    common in a cell of the disk, without the limb. Each disk's pose and own light are fitted too, since they had
+    absorbed part of the glints. `known` (C, G, G): the glints in the residuals' model.
     """
     cameras, others = use.shape[1], at.design.double()
     precision = (at.weight / at.variance * use.reshape(-1, 1)).double()
@@ -154,8 +152,8 @@ def learn_glints(at: Residuals, use: Tensor, known: Tensor) -> Tensor:
 
 
 def glint_shares(at: Residuals, use: Tensor, mirrored: Tensor) -> Tensor:
-    """Return by how much of what B * C disks, those of `use` (B, C), would leave in a cell its glint changes with it,
-    (C, G * G), 0 .. 1: by nothing where the light has none. `mirrored` (L, P) is what the light mirrors there.
+    """Return the share of a common residual in a cell of B * C disks, those in `use` (B, C), that the glint takes up,
+    (C, G * G), 0 .. 1; 0 for a light without glints. `mirrored` (L, P): what the light mirrors there.
     """
     cameras, precision = use.shape[1], (at.weight / at.variance * use.reshape(-1, 1)).double()
     there, weight, pull, sums = _in_cells(at, precision, cameras, mirrored[:, None].double())
@@ -166,14 +164,14 @@ def glint_shares(at: Residuals, use: Tensor, mirrored: Tensor) -> Tensor:
 
 
 def glint_cells(across: Tensor) -> Tensor:
-    """Return the cells of places across the disk, (L, 2, P): (L, P)."""
+    """Return the cells (L, P) of positions (L, 2, P) on the disk."""
     column, row = ((across + 1.0) * (0.5 * GLINTS)).long().clamp(0, GLINTS - 1).unbind(1)
     return row * GLINTS + column
 
 
 def _in_cells(at: Residuals, precision: Tensor, cameras: int, others: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return n cells that some disk tells of (the rest is beyond the limb, or hidden in every picture), the sums there
-    of precision (L, P), residuals (B, C, n) and others (L, k, P): (L, k, n). Pixels that the limb cuts are out.
+    """Return the n cells that some disk shows (not beyond the limb, not always hidden), and the sums in them of
+    precision (L, P), residuals (B, C, n) and others (L, k, P): (L, k, n). Pixels cut by the limb are left out.
     """
     inside = precision * (at.view.coverage > IN_SIGHT)
     parts = torch.cat([inside[:, None], (inside * at.residual)[:, None], inside[:, None] * others], dim=1)
@@ -186,9 +184,9 @@ def _in_cells(at: Residuals, precision: Tensor, cameras: int, others: Tensor) ->
 
 
 def _drawn(weight: Tensor, pull: Tensor, glint: Tensor) -> Tensor:
-    """Return the precision with which the n cells of a glint are known to be 0, (C, n): it follows from how large they
-    are (C, n), beside the scatter over the disks of what these leave, precision and its product with residuals
-    (B, C, n). Of a mat ball nothing else counts.
+    """Return the prior precision of the n cells of a glint about 0, (C, n), from the glint's size (C, n) and the
+    scatter of residuals over the disks: precision and its product with residuals (B, C, n). For a mat ball the prior
+    dominates.
     Source: empirical Bayes, James and Stein 1961.
     """
     whole = weight.sum(0).clamp_min(1e-30)
@@ -201,13 +199,13 @@ def _drawn(weight: Tensor, pull: Tensor, glint: Tensor) -> Tensor:
 
 
 def light_columns(view: SphereView) -> Tensor:
-    """Return what each coefficient of light maps, K of difference and K of black, adds to L disks, (L, 2 K, P)."""
+    """Return what each coefficient of the light maps, K of difference and K of black, adds to L disks, (L, 2 K, P)."""
     basis = light_basis(view.across)
     return torch.cat([(view.coverage * view.paint)[:, None] * basis, view.coverage[:, None] * basis], dim=1)
 
 
 def light_sums(columns: Tensor, view: SphereView, pixels: Pixels, precision: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the normal equations of what columns (L, n, P) add to L disks, (L, n, n) and (L, n); precision (L, P)."""
+    """Return the normal equations (L, n, n), (L, n) of columns (L, n, P) in L disks; precision (L, P)."""
     weighted = columns * precision[:, None]
     target = pixels.grey - (1.0 - view.coverage) * pixels.behind
     return (weighted @ columns.mT).double(), (weighted @ target[..., None])[..., 0].double()
@@ -215,7 +213,7 @@ def light_sums(columns: Tensor, view: SphereView, pixels: Pixels, precision: Ten
 
 def solved_light(normal: Tensor, right: Tensor) -> Tensor:
     """Solve summed normal equations (..., n, n), (..., n) for coefficients of light maps, (..., n)."""
-    # The basis is nearly dependent (x^2 + y^2 + depth^2 = 1): a ridge picks the smallest coefficients.
+    # The basis is nearly dependent (x^2 + y^2 + depth^2 = 1): a ridge selects the smallest coefficients.
     ridge = RIDGE * normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-9)
     solution: Tensor = torch.linalg.solve(normal + torch.diag_embed(ridge), right)
     return solution.float()

@@ -1,4 +1,4 @@
-"""Which light a movie has: one in the lab unless maps of each disk explain the pictures better."""
+"""The choice of a movie's light: in the lab, unless maps of each disk explain the pictures better."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -16,15 +16,15 @@ from sphereorient.pose.poses import FittedPoses
 
 KINDS: tuple[type[Light], ...] = (DiskLight, LabLight)
 FEWEST_LIT = 8  # rows of poses from which the light in the lab is learnt
-TURNED_RAD = 0.2  # mean angle between them: the finest details of light are as wide, and of less turn they take paint
-# Shares of the variance: which it may leave more, and within which two lights explain about as much.
+TURNED_RAD = 0.2  # mean angle between them, as wide as the finest details of light; with less, light absorbs paint
+# Shares of the variance: allowed excess of the light in the lab; difference below which two lights count as equal.
 CHANGED, ALIKE = 0.01, 0.05
 
 Rivals = tuple[FittedPoses, FittedPoses, Tensor] | None  # fits of the same pictures by two models, and `use` (B, C)
 
 
 def light_of(parts: Mapping[str, Tensor], known: bool) -> Light:
-    """Return the light that consists of tensors, `Light.parts` and others; older files lack some."""
+    """Return the light made of tensors by name, `Light.parts` or a file's; older files lack some."""
     parts = {**even_light(len(parts["noise"])), **parts}
     kind = next((kind for kind in KINDS if parts.keys() >= set(kind.names())), DiskLight)
     return kind(known=known, **{name: parts[name] for name in kind.names()})
@@ -32,9 +32,9 @@ def light_of(parts: Mapping[str, Tensor], known: bool) -> Light:
 
 def lit_in_the_lab(fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple[Fitter, FittedPoses, Rivals]:
     """Return a fitter with one light in the lab for all cameras, and its fit, unless maps of the disks explain more:
-    it has fewer freedoms, and hardly any that look like a turn of the ball.
-    Both are learnt from every other row of `use` (B, C); what counts is what they leave in the pictures of the rows
-    between. Return the fits of these rows by both where they explain about as much.
+    the light in the lab has fewer unknowns, and hardly any that resemble a rotation of the ball.
+    Both are learnt from every other row of `use` (B, C) and compared by their residuals in the other rows. Return also
+    the fits of these rows by both if the residuals are about equal.
     """
     R = fit.R_lab_body
     if len(use) < FEWEST_LIT or so3.geodesic_distance(R[:, None], R).mean() < TURNED_RAD:
@@ -47,13 +47,13 @@ def lit_in_the_lab(fitter: Fitter, pixels: Pixels, fit: FittedPoses, use: Tensor
     rivals = (by_maps, by_lit, held_use) if abs(gain) < ALIKE else None
     if gain < -CHANGED:
         return fitter, fit, rivals
-    for _ in range(3):  # the poses, too, were found with the maps
+    for _ in range(3):  # the poses were fitted with the maps, too
         lit = lit.with_light_of(pixels, fit, use)
         fit = lit.again(pixels, fit, use)
     return lit, fit, rivals
 
 
 def some_of(rows: Tensor, pixels: Pixels, fit: FittedPoses, use: Tensor) -> tuple[Pixels, FittedPoses, Tensor]:
-    """Return some rows of poses, of their B * C disks, and of `use` (B, C), by index."""
+    """Return some rows of poses, their B * C disks and `use` (B, C), by index."""
     cameras = use.shape[1]
     return pixels.where((rows[:, None] * cameras + torch.arange(cameras)).reshape(-1)), fit.of(rows), use[rows]

@@ -1,4 +1,4 @@
-"""One light in the lab for all cameras and places: what the paint scatters, and what its gloss mirrors."""
+"""One light in the lab for all cameras and places: light scattered by the paint, and mirrored by its gloss."""
 
 import math
 from dataclasses import dataclass, replace
@@ -31,36 +31,36 @@ from sphereorient.sphere.texture_table import octahedral_cells, octahedral_direc
 from sphereorient.sphere.view import polynomials
 
 SCATTERED, MIRRORED = 6, 16  # degrees of the harmonics over the normal and over the mirrored direction
-KNOTS = (0.0, 0.12, 0.22, 0.32, 0.45, 0.6, 0.8, 1.0)  # depths, radii, between which the paint's cover is linear
-# Share of the light that a smooth cover of refractive index 1.5 mirrors at the knots. Source: Fresnel 1823.
+KNOTS = (0.0, 0.12, 0.22, 0.32, 0.45, 0.6, 0.8, 1.0)  # depths, radii; the cover of the paint is linear between them
+# Share of the light mirrored at the knots by a smooth cover of refractive index 1.5. Source: Fresnel 1823.
 FRESNEL = (1.0, 0.421, 0.217, 0.125, 0.072, 0.051, 0.041, 0.04)
 SIDE = 256  # cells per axis of a look-up map
-BASIS_SIDE = 128  # the same of the harmonics that light is learnt with: 20 MB
+BASIS_SIDE = 128  # the same for the harmonics of the estimate: 20 MB
 DEPTHS = 1024  # entries of the look-up of the cover's functions
 GRID = 360  # rows of latitude from which the look-up maps are interpolated: half a degree
-ROUNDS, AGAIN = 5, 1  # of Gauss-Newton from an even light, from one of the lab
+ROUNDS, AGAIN = 5, 1  # Gauss-Newton steps from an even light, from a light in the lab
 AT_ONCE = 4  # poses whose products are summed in single precision
-INDEPENDENT = 0.1  # share of the pixels that tell of the light: neighbours err alike; with it other frames fit best
-# Standard deviations known beforehand. Of harmonics of degree l, over 1 + l, in units of white less black paint:
-LEVEL, SLOPES, GLOSS = 3.0, 0.2, 3.0  # the mean, all others, those of the mirrored light: lamps are brighter than paint
-THROUGH, FACE = 0.2, 0.3  # of the cover's two functions at a knot, the second relative
+INDEPENDENT = 0.1  # share of independent pixels, as errors of neighbours are correlated; other frames fit best with it
+# Prior standard deviations. For harmonics of degree l, to be divided by 1 + l, in units of white less black paint:
+LEVEL, SLOPES, GLOSS = 3.0, 0.2, 3.0  # the mean, all others, mirrored light: lamps are brighter than paint
+THROUGH, FACE = 0.2, 0.3  # of the cover's two functions at a knot, the second one relative
 TINT = (0.15, 0.08, 0.08)  # of a frame's own light, relative, by order
 SHADE = (0.04, 0.02)  # of its own offset, in units of white less black paint
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LabLight(Light):
-    """Light that depends on directions in the lab only. At depth z below the disk's face, where the normal is n and the
-    line of sight d, a pixel of the sphere shows
+    """Light that depends only on directions in the lab. At depth z below the disk's face, with normal n and line of
+    sight d, a pixel of the sphere shows
     gain (through(z) (paint difference(n) + black(n)) + mirrored(z) gloss(d + 2 z n)).
     """
 
-    difference: Tensor  # (K,), harmonics
+    difference: Tensor  # (K,), harmonics, grey levels
     black: Tensor  # (K,)
     gloss: Tensor  # (M,), harmonics of the mirrored surroundings, grey levels
-    through: Tensor  # (n,), share of light that leaves the paint, at KNOTS of the depth; 1 at the disk's middle
+    through: Tensor  # (n,), share of light that leaves the paint, at the KNOTS; 1 at the disk's middle
     mirrored: Tensor  # (n,), share of light that the surface mirrors
-    gain: Tensor  # (C,), of the cameras
+    gain: Tensor  # (C,), of each camera
 
     of_cameras = ("noise", "stray", "lean", "dark", "gain")
     linear = False
@@ -106,7 +106,7 @@ class LabLight(Light):
     def learnt(
         self, pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, *, glints: bool = True
     ) -> "LabLight":
-        """Estimate light and noise from this light on; see `Light.learnt`."""
+        """Estimate light and noise, starting from this light; see `Light.learnt`."""
         return lab_light(pixels, fit, use, model, self)
 
 
@@ -120,7 +120,7 @@ def directions(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor
 
 
 def knot_shares(depth: Tensor) -> Tensor:
-    """Return the shares (..., n) of the knots in a function that is linear between them, at depths (...)."""
+    """Return the shares (..., n) of the knots in a piecewise linear function at depths (...)."""
     knots = depth.new_tensor(KNOTS)
     low, high = knots[:-1], knots[1:]
     up = ((depth[..., None] - low) / (high - low)).clamp(0.0, 1.0)
@@ -130,10 +130,10 @@ def knot_shares(depth: Tensor) -> Tensor:
 
 def harmonics(direction: Tensor, degree: int) -> Tensor:
     """Return the real spherical harmonics (..., (degree + 1)^2) float64 at unit directions (..., 3).
-    Their mean square over the sphere is 1; degree l has the places l^2 .. (l + 1)^2, order -l first.
+    Their mean square over the sphere is 1; degree l has the indices l^2 .. (l + 1)^2, order -l first.
     """
     x, y, z = direction.double().cpu().numpy().reshape(-1, 3).T
-    polar, place = np.unique(np.arccos(np.clip(z, -1.0, 1.0)).round(14), return_inverse=True)  # maps repeat them
+    polar, place = np.unique(np.arccos(np.clip(z, -1.0, 1.0)).round(14), return_inverse=True)  # many repeat in maps
     along = math.sqrt(8.0 * math.pi) * sph_legendre_p_all(degree, degree, polar)[0]
     turn = np.arange(degree + 1)[:, None] * np.arctan2(y, x)
     cos, sin = np.cos(turn), np.sin(turn)
@@ -170,7 +170,7 @@ def _longitudes(degree: int) -> Tensor:
 def _on_grid(coefficients: Tensor, degree: int) -> Tensor:
     """Return a sum of harmonics on a grid of latitudes and longitudes, (GRID, 2 GRID)."""
     degrees, orders = torch.tensor([(n, m) for n in range(degree + 1) for m in range(-n, n + 1)]).T
-    # Of the orders m and -m the meridian y = 0 shows that of the cosine; both have the same latitudes.
+    # On the meridian y = 0 only the cosine of orders m and -m is not 0; both have the same latitude factor.
     each = _meridian(degree)[:, degrees * (degrees + 1) + orders.abs()] * coefficients.double().cpu()
     return each.new_zeros(GRID, 2 * degree + 1).index_add(1, orders + degree, each) @ _longitudes(degree)
 
@@ -184,9 +184,9 @@ def _cells_on_grid() -> tuple[Tensor, Tensor]:
 def lab_light(
     pixels: Pixels, fit: FittedPoses, use: Tensor, model: SphereModel, first: LabLight | None = None
 ) -> LabLight:
-    """Estimate the light and the noise of the fits of B * C disks, those of `use` (B, C) bool.
-    Gauss-Newton from the first light, None: an even one as bright as that of the model; each frame's light may
-    differ a little, as its tints do in the fit, and its pose may change: a light at given poses favours them.
+    """Estimate light and noise from the fits of B * C disks, those in `use` (B, C) bool.
+    Gauss-Newton from the first light (None: an even one as bright as the model's). Each frame's light may differ a
+    little, as in the fit, and poses are fitted too: a light at fixed poses would favour them.
     Source: irradiance as harmonics of the normal, Ramamoorthi and Hanrahan 2001.
     """
     used = use.reshape(-1, 1)
@@ -204,7 +204,7 @@ def lab_light(
 
 
 def _bases(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what the light is linear in, (L, n, P) each: harmonics of normal and of mirrored direction, the knots."""
+    """Return the bases of the light, (L, n, P) each: harmonics of normal and mirrored direction, and the knots."""
     normal, mirror, depth = directions(view, pixels)
     over = []
     for part, degree in ((normal, SCATTERED), (mirror, MIRRORED)):
@@ -214,7 +214,7 @@ def _bases(view: SphereView, pixels: Pixels) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _flat(known: Light, view: SphereView, pixels: Pixels, use: Tensor) -> LabLight:
-    """Return an even light as bright as a known one, without gloss; a camera that is never in use has gain 1."""
+    """Return an even light as bright as a known one, without gloss; a camera never in use has gain 1."""
     used, cameras = use.reshape(-1, 1), use.shape[1]
     share = by_pose(view.coverage.where(used, 0.0), cameras)
     bright = [by_pose(part.where(used, 0.0), cameras) for part in known.at(view, pixels)]
@@ -247,7 +247,7 @@ def _better(
     expected, deviation = _beforehand(unit)
     known = deviation.double() ** -2
     step = torch.linalg.solve(sums[:-1, :-1] + known.diag(), sums[:-1, -1] + known * (expected - now))
-    # What all frames share of their own factor is of the light, what those of a camera share beside it is its gain.
+    # A factor common to all frames belongs to the light; one common to a camera's frames is its gain.
     own_factor, number = factor[:, -1] - factor[:, :-1] @ step, by_pose(used[:, 0], cameras).sum(0)
     shared = (1.0 + by_pose(own_factor, cameras).sum(0) / number.clamp_min(1)).float()
     first = int((number > 0).int().argmax())
@@ -259,8 +259,8 @@ def _better(
 def _sums(
     light: LabLight, at: Residuals, pixels: Pixels, used: Tensor, bases: tuple[Tensor, Tensor, Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """Return the products of all pairs of unknowns and of what is left, (n + 1, n + 1) float64, poses and the frames'
-    own lights eliminated; and by how much each disk's own factor of the light changes with them, (L, n + 1).
+    """Return the products of all pairs of unknowns and the residuals, (n + 1, n + 1) float64, poses and the frames' own
+    lights eliminated; and how each disk's own factor of the light changes with them, (L, n + 1).
     """
     unit, view, cameras = float(light.difference[0]), at.view, len(light.gain)
     precision = INDEPENDENT * (at.weight / at.variance).where(used, 0.0)
@@ -273,7 +273,7 @@ def _sums(
     tints = polynomials(view.across, 2)
     own = torch.cat([learnt[:, None] * tints, view.coverage[:, None] * tints[:, :3]], dim=1)
     last = ((view.coverage > 0).any(0) * torch.arange(1, view.coverage.shape[1] + 1)).amax()
-    there = slice(int(last))  # places lie in order of distance from the disk's middle
+    there = slice(int(last))  # places are in order of distance from the disk's middle
     width = sum(len(getattr(light, name)) for name in UNKNOWN) + 1
 
     def of_disk(k: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -286,7 +286,7 @@ def _sums(
         return rows, torch.cat([own[k, :, there], at.design[k, :6, there]]), precision[k, there]
 
     def of_poses(some: list[int]) -> tuple[list[int], Tensor, Tensor]:
-        """The cameras of a pose share it, and each has a light of its own."""
+        """Join the cameras of a pose, which share it; each has its own light."""
         tints, count = len(tied), cameras * len(tied)
         sums = _SymmetricSums(width)
         mixed = torch.zeros(len(some), count + 6, width, dtype=torch.float64)
@@ -304,7 +304,7 @@ def _sums(
         left_over = sums.matrix().double() - mixed.flatten(0, 1).T @ taken.flatten(0, 1)
         return some, left_over, taken[:, :count:tints]
 
-    # A few poses at a time: the columns of all would fill the memory.
+    # A few poses at a time: the columns of all need too much memory.
     blocks = torch.split(by_pose(used, cameras).any(1).nonzero()[:, 0], AT_ONCE)
     whole, factor = torch.zeros(width, width).double(), torch.zeros(len(used), width).double()
     for some, sums, own_part in side_by_side(of_poses, [part.tolist() for part in blocks]):
@@ -314,14 +314,14 @@ def _sums(
 
 
 class _SymmetricSums:
-    """Sums of the weighted products of all pairs of n rows: of its four quarters two are mirror images."""
+    """Sums of weighted products of all pairs of n rows; two of the matrix' four quarters are each other's transpose."""
 
     def __init__(self, count: int) -> None:
         half, rest = count // 2, count - count // 2
         self._quarters = torch.zeros(half, half), torch.zeros(rest, half), torch.zeros(rest, rest)
 
     def add(self, rows: Tensor, weight: Tensor) -> None:
-        """Add those of places: rows (n, P), weight (P,)."""
+        """Add the products of rows (n, P) with weights (P,)."""
         upper, beside, lower = self._quarters
         first, last, weighted = rows[: len(upper)].T, rows[len(upper) :].T, rows * weight
         upper.addmm_(weighted[: len(upper)], first)
@@ -335,12 +335,12 @@ class _SymmetricSums:
 
 
 def _beforehand(unit: float) -> tuple[Tensor, Tensor]:
-    """Return what is expected of the unknowns of the light, and its standard deviation; `unit`: white less black."""
+    """Return the prior mean of the light's unknowns, and its standard deviation; `unit`: white less black."""
     degree = [torch.tensor([n for n in range(most + 1) for _ in range(2 * n + 1)]) for most in (SCATTERED, MIRRORED)]
     scattered = torch.where(degree[0] == 0, LEVEL, SLOPES / (1 + degree[0])) * unit
     mirrored = GLOSS / (1 + degree[1]) * unit
     knots = torch.ones(len(KNOTS))
-    free = torch.cat([knots[:-1], 1e-6 * knots[-1:]])  # at the disk's middle both are given
+    free = torch.cat([knots[:-1], 1e-6 * knots[-1:]])  # fixed at the disk's middle
     fresnel = torch.tensor(FRESNEL)
     deviation = torch.cat([scattered, scattered, mirrored, THROUGH * free, FACE * free * fresnel])
     harmonic = torch.zeros(len(deviation) - 2 * len(knots))
