@@ -125,7 +125,7 @@ def _blobs(grey: NDArray[np.float32], settings: DotSettings) -> tuple[Floats, Fl
 def _ellipses_at(
     mask: NDArray[np.bool_], settings: DotSettings
 ) -> tuple[NDArray[np.int32], dict[int, int], Floats, Floats, Floats]:
-    """Return labels of the mask's components; of the ellipses among them the number, area, centre and shape."""
+    """Return the labels of the mask's components, and label, area, centre and shape of those that are ellipses."""
     height, width = mask.shape
     pieces: Any = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     labels, stats = pieces[1], pieces[2]

@@ -183,7 +183,7 @@ def _looked(
     shown: "NDArray[np.bool_] | None" = None,
     circle: tuple[float, float, float] | None = None,
 ) -> "list[FirstLook]":
-    """Examine movies, draw the findings beside the file to write; `shown` (as `look_at`), `circle`: FicTrac's."""
+    """Examine the movies and draw the findings beside the output file; `shown`: see `look_at`, `circle`: FicTrac's."""
     picture = target.with_suffix(".png")
     check_writable(picture)
     from sphereorient.preflight.first_look import look_at, with_circle

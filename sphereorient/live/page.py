@@ -100,7 +100,7 @@ class Monitor:
             yield arrival
 
     def saw(self, now: Measured) -> None:
-        """Take the measurement of a ball in the last frame."""
+        """Store the measurement of a ball in the last frame."""
         if now.number != self._counted:
             self.count, self._counted = self.count + 1, now.number
             self.latency_ms.append(1e3 * now.latency_s)

@@ -258,7 +258,7 @@ class FirstPass:
         return (fit if bool(self._explained(fit, use)[0]) else None), True
 
     def _searched(self, even: Sequence[NDArray[np.float32]], use: Tensor, R: Tensor) -> FittedPoses:
-        """Return the best fit near any of many orientations (M, 3, 3)."""
+        """Return the best of the fits that start at orientations (M, 3, 3)."""
         frames, begin = self._start([even], R, use)
         level = self._fitter.optics.fine
         one = self._fitter.pixels(frames, self._X[None], level).thinned(TRIED_EVERY)
