@@ -146,7 +146,9 @@ def test_outlines_that_are_wider_than_high_tell_wide_pixels_from_a_wrong_diamete
     """A ball in the middle of the picture: its size alone fits either."""
     seen = seen_by(CAMERAS, diameter_mm=0.985 * MM)
     round_, wide = torch.zeros_like(seen.radius_px), torch.full_like(seen.radius_px, -0.03)
-    assert compare_cameras(replace(seen, outline_stretch=round_), LIMITS).advice.startswith("sphere.diameter")
+    assert compare_cameras(replace(seen, outline_stretch=round_), LIMITS).advice.startswith(
+        "the pictures fit sphere.diameter"
+    )
     found = compare_cameras(replace(seen, outline_stretch=wide), LIMITS)
     assert found.advice.startswith("pixels of cam1 and cam2 -3")
 

@@ -57,7 +57,7 @@ def test_a_ball_that_rests_has_no_map(tmp_path):
     done, out = run(path)
     assert done.exit_code == 1
     assert isinstance(done.exception, SphereOrientError)
-    assert "turns" in str(done.exception)
+    assert "rotates" in str(done.exception)
     assert not out.exists()
     assert not (path.parent / "own.png").exists()
 

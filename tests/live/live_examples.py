@@ -13,7 +13,7 @@ from overlay_examples import true_track
 from sphereorient import so3
 from sphereorient.live.feed import Arrival
 from sphereorient.live.live import Measured, measured
-from sphereorient.live.loop import LiveSetUp, open_live
+from sphereorient.live.loop import LiveSetup, open_live
 from sphereorient.methods.method import Learnt, save_learnt
 from sphereorient.methods.settings import Settings
 from sphereorient.pose.poses import no_pose
@@ -35,7 +35,7 @@ def known(places: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def excerpt_opened(places: pytest.TempPathFactory) -> Iterator[LiveSetUp]:
+def excerpt_opened(places: pytest.TempPathFactory) -> Iterator[LiveSetup]:
     with open_live(EXCERPT / "experiment.yaml", Settings(), None, known(places)) as opened:
         yield opened
 
@@ -46,7 +46,7 @@ def off_deg(now: Measured, k: int) -> float:
     return math.degrees(float(so3.geodesic_distance(R, truth)))
 
 
-def followed(opened: LiveSetUp, frames: Iterable[Arrival]) -> list[Measured]:
+def followed(opened: LiveSetup, frames: Iterable[Arrival]) -> list[Measured]:
     return list(measured(opened.tracker, opened.tracker.appearances[""].fitter.views, frames))
 
 

@@ -50,7 +50,7 @@ def test_a_movie_that_claims_far_more_than_was_written_is_refused(tmp_path):
         data = file.create_dataset("frames", (10**8, *shape), "u1", chunks=(1, *shape), compression="gzip")
         for k in (*range(8), 10**8 - 1):
             data[k] = 0
-    with pytest.raises(MovieError, match="9 among 100000000"):
+    with pytest.raises(MovieError, match="9 of 100000000"):
         open_movie(tmp_path / "movie.h5")
     with h5py.File(tmp_path / "large.h5", "w") as file:
         file.create_dataset("frames", (2, 10_000, 7_000), "u1", chunks=(1, 10_000, 7_000), compression="gzip")[1] = 0

@@ -373,7 +373,7 @@ def test_init_replaces_its_own_file_until_somebody_changes_it(tmp_path):
     second = out.read_text()
     assert second != first
     out.write_text(second.replace("diameter: 18", "diameter: 19"))
-    with pytest.raises(SphereOrientError, match=r"changed since; .*--force"):
+    with pytest.raises(SphereOrientError, match=r"changed draft.*--force"):
         init(movie, "--out", out)
     assert "diameter: 19" in out.read_text()
     assert not has_mark(out)
