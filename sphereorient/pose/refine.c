@@ -67,7 +67,7 @@ typedef struct {
     float most_hidden, covered, most_each, least_of_window;
     int64_t window, margin;        /* half widths, px */
     const int64_t *place;          /* (2, places), px to the right and below */
-    /* of `linearise`: expected grey levels and weights of an earlier call, (disks, places), or none; what it tells of
+    /* of `linearise`: expected grey levels and weights of an earlier call, (disks, places), or none; its output for
        each place, (disks, FLOATS + 2, places), as `Disk`, then expected and weight; and of each disk */
     const float *expected, *weight;
     float *columns;
@@ -83,12 +83,12 @@ typedef struct {
     const double *position, *rotation; /* of the pose */
     uint8_t *kept;                     /* (places), inside and not hidden by an occluder */
     float *expected, *weight;          /* (places) */
-    int first, last;                   /* whether these are unknown; whether scores and `told` are asked for */
+    int first, last;                   /* whether these are unknown; whether scores and `figures` are asked for */
     double *scores;                    /* (tiles, n), n = 6 + n_difference + n_black */
     double normal[COLUMNS * COLUMNS], gradient[COLUMNS];
     double coefficients[COLUMNS], deviation;
     double information[36], pull[6];
-    double told[4];      /* share of variance explained, loss, median step from black to white, limb that counts, 1/mm */
+    double figures[4];      /* share of variance explained, loss, median step from black to white, limb that counts, 1/mm */
     double to_centre[3]; /* from the camera, mm */
 } Sums;
 
@@ -244,7 +244,7 @@ static void render(const Task *t, const Disk *to, const Sums *of, int64_t k, int
             sight_b[b][i] = R[0][b] * d[0][i] + R[1][b] * d[1][i] + R[2][b] * d[2][i];
             out_b[b][i] = R[0][b] * out[0][i] + R[1][b] * out[1][i] + R[2][b] * out[2][i];
         }
-    int within = 1, beyond = !t->unseen.rows; /* the limb's paint tells whether that of a place beyond is known */
+    int within = 1, beyond = !t->unseen.rows; /* the limb's paint shows whether that of a place beyond is known */
     for (int i = 0; i < n; i++) within &= edge[i] >= t->edge_far, beyond &= edge[i] <= -t->edge_far;
     const int outer = from >= t->inner, columns = outer ? EDGE_COLUMNS : 4;
     const float *table = t->edge, edges = (float)(t->edges - 1);
@@ -523,7 +523,7 @@ static float light_up(const Task *t, const Disk *at, const Sums *of, int64_t k, 
     solve(matrix, coefficients, count, 1, 1e-7);
     float by[COLUMNS];
     for (int c = 0; c < count; c++) by[c] = (float)coefficients[c];
-    int64_t told = 0;
+    int64_t finite = 0;
     for (int64_t from = 0; from < P; from += BLOCK) {
         const int n = (int)(P - from < BLOCK ? P - from : BLOCK);
         lit_columns(t, at, from, n, tints, column);
@@ -539,7 +539,7 @@ static float light_up(const Task *t, const Disk *at, const Sums *of, int64_t k, 
             residual[i] = seen[i] - beyond - painted[i];
             variance[i] = noise_variance(own, wanted[i], floor_);
         }
-        /* A saturated pixel tells only that its grey level is at least this one. */
+        /* A saturated pixel shows only that its grey level is at least this one. */
         for (int i = 0; i < n; i++) {
             const int silent = clipped[from + i] & (residual[i] <= 0.0f);
             residual[i] = silent ? 0.0f : residual[i];
@@ -549,9 +549,9 @@ static float light_up(const Task *t, const Disk *at, const Sums *of, int64_t k, 
     for (int64_t p = 0; p < P; p += EVERY)
         if (inside[p]) {
             const float square = at->residual[p] * at->residual[p] / at->variance[p];
-            if (square == square) at->sorted[told++] = square;
+            if (square == square) at->sorted[finite++] = square;
         }
-    const float deviation = told ? 1.4826f * sqrtf(ranked(at->sorted, told, (told - 1) / 2)) : 0.0f;
+    const float deviation = finite ? 1.4826f * sqrtf(ranked(at->sorted, finite, (finite - 1) / 2)) : 0.0f;
     const float scale = most(deviation, 1.0f) * most(deviation, 1.0f);
     float *variance = at->variance;
     const float *residual = at->residual, limit = t->tukey2;
@@ -669,7 +669,7 @@ static double score_of(const Task *t, const Disk *at, int64_t k) {
                 for (int a = 0; a < TINTS; a++)
                     for (int i = 0; i < BLOCK; i++) disk[i] -= by[a] * tints[a][i];
                 for (int i = 0; i < BLOCK; i++) {
-                    /* a saturated pixel tells only that its grey level is at least this one */
+                    /* a saturated pixel shows only that its grey level is at least this one */
                     const float lowest = full[i] ? 0.0f : -FLT_MAX;
                     const float smoothly = most(disk[i], lowest), empty = most(grey[i] - beside[i], lowest);
                     left[0] += counted[i] * least(residual[i] * residual[i], limit);
@@ -699,7 +699,7 @@ static double score_of(const Task *t, const Disk *at, int64_t k) {
 static void tell(const Task *t, const Disk *at, Sums *of, int64_t k, float deviation) {
     const int64_t P = t->places;
     const float scale = logf(most(deviation, 1.0f)), sixth = t->tukey2 / 6.0f, limit = t->tukey2;
-    double *told = of->told, loss = 0;
+    double *figures = of->figures, loss = 0;
     float part[BLOCK], all[BLOCK];
     for (int64_t from = 0; from < P; from += BLOCK) {
         const int n = (int)(P - from < BLOCK ? P - from : BLOCK);
@@ -714,14 +714,14 @@ static void tell(const Task *t, const Disk *at, Sums *of, int64_t k, float devia
         for (int i = 0; i < n; i++) all[i] = of->kept[from + i] ? 1.0f : 0.0f;
         loss += product(all, part);
     }
-    told[0] = score_of(t, at, k);
-    told[1] = loss;
+    figures[0] = score_of(t, at, k);
+    figures[1] = loss;
     for (int64_t p = 0; p < t->inner; p++) at->sorted[p] = most(at->lit[p], 0.0f); /* below 1 all count alike */
-    told[3] = 0;
+    figures[3] = 0;
     for (int64_t p = 0; p < P; p++)
         if (of->weight[p] > 0.0f)
-            told[3] += sqrtf(at->limb[0][p] * at->limb[0][p] + at->limb[1][p] * at->limb[1][p] + at->limb[2][p] * at->limb[2][p]);
-    told[2] = t->inner ? ranked(at->sorted, t->inner, (t->inner - 1) / 2) : 0.0;
+            figures[3] += sqrtf(at->limb[0][p] * at->limb[0][p] + at->limb[1][p] * at->limb[1][p] + at->limb[2][p] * at->limb[2][p]);
+    figures[2] = t->inner ? ranked(at->sorted, t->inner, (t->inner - 1) / 2) : 0.0;
 }
 
 /* Eliminate the light's coefficients, from the scores as well. */
@@ -782,7 +782,7 @@ static int uncover(const Task *t, const Disk *at, Sums *of, int64_t k) {
     const int64_t cells = width * height, origin = (margin - at->first[1]) * width + margin - at->first[0];
     const int64_t *right = t->place, *down = t->place + P;
     float *squares = at->lit, *differs = at->grid[0], *counted = at->grid[1], *work = at->grid[2];
-    int64_t told = 0, all = 0, hidden = 0;
+    int64_t finite = 0, all = 0, hidden = 0;
     const float own[4] = {noise[0], noise[1], noise[2], noise[3]}, floor_ = t->noise_least, *expected = of->expected;
     INDEPENDENT
     for (int64_t p = 0; p < P; p++) {
@@ -790,8 +790,8 @@ static int uncover(const Task *t, const Disk *at, Sums *of, int64_t k) {
         squares[p] = residual * residual / noise_variance(own, expected[p], floor_);
     }
     for (int64_t p = 0; p < P; p += EVERY)
-        if (at->counts[p] && !clipped[p] && squares[p] == squares[p]) at->sorted[told++] = squares[p];
-    const float deviation = told ? 1.4826f * sqrtf(ranked(at->sorted, told, (told - 1) / 2)) : 0.0f;
+        if (at->counts[p] && !clipped[p] && squares[p] == squares[p]) at->sorted[finite++] = squares[p];
+    const float deviation = finite ? 1.4826f * sqrtf(ranked(at->sorted, finite, (finite - 1) / 2)) : 0.0f;
     const float scale = most(deviation, 1.0f) * most(deviation, 1.0f);
     memset(differs, 0, sizeof(float) * (size_t)cells), memset(counted, 0, sizeof(float) * (size_t)cells);
     for (int64_t p = 0; p < P; p++)
@@ -951,13 +951,13 @@ static void conclude(const Task *t, const Sums *sums, int64_t pose, const double
             for (int b = 0; b < 3; b++)
                 across -= to_centre[a] * own[(3 + a) * 6 + 3 + b] * to_centre[b] / (distance * distance);
         t->own_sigma[k] = sqrt((across > 0 ? across : 0) / 2);
-        t->score[k] = of->told[0];
+        t->score[k] = of->figures[0];
         const double px_mm = (double)t->pitch_mm[k] + (double)t->pitch_rad[k] * distance;
         const double angle = 1 - radius * radius / (distance * distance);
-        const double limb = place_px2(t) * of->told[3] * px_mm * px_mm * angle * angle / (TWO_PI * radius);
+        const double limb = place_px2(t) * of->figures[3] * px_mm * px_mm * angle * angle / (TWO_PI * radius);
         t->limb_coverage[k] = limb > 1 ? 1 : limb;
         if (!use[c]) continue;
-        nll += of->told[1];
+        nll += of->figures[1];
         /* An edge that is a pixel off moves the sphere along each line of sight. */
         double edge[6], moved[6];
         for (int a = 0; a < 6; a++) {
@@ -973,7 +973,7 @@ static void conclude(const Task *t, const Sums *sums, int64_t pose, const double
         const float *stray = t->stray + c * HARMONICS;
         double square = (double)stray[0] * stray[0];
         for (int h = 1; h < HARMONICS; h++) square += 0.5 * stray[h] * stray[h];
-        const double moved_px = t->blur_px * sqrt(square) / (of->told[2] > 1 ? of->told[2] : 1);
+        const double moved_px = t->blur_px * sqrt(square) / (of->figures[2] > 1 ? of->figures[2] : 1);
         aside_px = moved_px > aside_px ? moved_px : aside_px;
         finest_mm = px_mm < finest_mm ? px_mm : finest_mm;
     }
