@@ -41,18 +41,19 @@ BLOCKS, DPI = 2, 120
 HEAD = """\
 # Degradations
 
-What can be wrong with pictures and with what is known of them, for the [robustness benchmark](robustness.md) and for
-training. `synth.write_degraded(folder, settings, {"defocus": 3, "spin": 2})` renders an experiment with exact truth and
-any number of them at once; `synth.degrade` applies those of pictures to a batch.
+Planted faults of pictures, cameras and maps, for the [robustness benchmark](robustness.md) and for training.
+`synth.write_degraded(folder, settings, {"defocus": 3, "spin": 2})` renders an experiment with exact truth and any
+number of them at once; `synth.degrade` applies those of pictures to a batch.
 
-![each degradation without, and at levels 1, 3 and 5](degradations.png)
+![Degradations](degradations.png)
 
-Blue is true, orange is what the method is given. Dropped frames: 50 of each camera, lost ones black.
+A picture without each degradation, and at levels 1, 3 and 5. Blue is true, orange is given to the method. Dropped
+frames: 50 of each camera, lost ones black.
 
-Level 1 is a good lab on a bad day, level 5 is where failure is expected. Degradations are applied in the order of the
-table, which is that of the light; last comes what the method is given. The default ball ([`synth`](parameters.md)) has
-78 px and rotates by 1.3 degrees a frame. Movies of several balls (`balls`) take all but `uneven_light`, `highlights`,
-`occlusion` and `bubbles`, which lie on the disk of one ball. `scripts/figure_degradations.py` makes table and figure.
+Level 1 may occur in a good lab; at level 5 failure is expected. Degradations are applied in the order of the table,
+which is that of the light, then of the files. The default ball ([`synth`](parameters.md)) has 78 px and rotates by 1.3
+degrees a frame. Movies of several balls (`balls`) take all but `uneven_light`, `highlights`, `occlusion` and `bubbles`,
+which lie on the disk of one ball. `scripts/figure_degradations.py` makes table and figure.
 
 | name | unit | nothing | 1 | 2 | 3 | 4 | 5 | what it does |
 |---|---|---|---|---|---|---|---|---|
