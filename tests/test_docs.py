@@ -21,6 +21,7 @@ import yaml
 from conftest import REPO
 from packaging.requirements import Requirement
 
+import sphereorient
 from sphereorient.calibration.document import CalibrationKeys, load_calibration
 from sphereorient.calibration.targets import KINDS, target_keys
 from sphereorient.cameras import load_cameras
@@ -310,3 +311,10 @@ def test_a_sentence_that_stands_twice_is_found_whatever_its_marks():
     second = "- The **ball** is found\n  by [its outline](a.md) in each picture. A short one."
     assert docs_words.twice({"a.md": first, "b.md": "A short one. A short one."}) == {}
     assert list(docs_words.twice({"a.md": first, "b.md": second}).values()) == [["a.md", "b.md"]]
+
+
+def test_version_citation_and_changelog_are_of_one_release():
+    cited = yaml.safe_load((REPO / "CITATION.cff").read_text())
+    sections = re.findall(r"^## \[(\d\S*)\] - (\S+)$", (REPO / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert sections[0] == (sphereorient.__version__, str(cited["date-released"]))
+    assert cited["version"] == sphereorient.__version__
