@@ -3,7 +3,7 @@
     scripts/make_excerpt.py EXPERIMENT_FOLDER OUT_FOLDER [--first 22] [--frames 40]
 
 The frames' grey values are kept exactly. Times begin at 0 again. The pictures of the empty scene are the clipped mean
-of the whole movie: in 40 frames the sphere moves too little to tell it from what lies behind.
+of the whole movie: in 40 frames the sphere moves too little to separate it from the background.
 """
 
 from __future__ import annotations
