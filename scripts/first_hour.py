@@ -4,8 +4,8 @@
 
 `tank`: two movies and plate pictures in a folder, nothing else. `fictrac`: the folder of FicTrac's sample movie. Both
 run the commands that `init` names. `wrong`: the first journey with a wrong input at each step. `notebook`: the
-toolkit's tutorial cell by cell, further calls of a user, and mistakes with their messages. Values that nobody can
-measure are given once, by `--set`. Prints Markdown; errors against the truth if there is one, by the shared
+toolkit's tutorial cell by cell, further calls of a user, and mistakes with their messages. Values that cannot be
+measured are given once, by `--set`. Prints Markdown; errors against the truth if there is one, by the shared
 score_track.py.
 """
 
@@ -34,7 +34,7 @@ import yaml
 
 REPO = Path(__file__).resolve().parents[1]
 PROGRAM = [sys.executable, "-m", "sphereorient.cli"]
-KNOWN = ["frame_rate=600", "sphere.diameter=18", "exposure=0.0004"]  # of the tank: what nobody can measure
+KNOWN = ["frame_rate=600", "sphere.diameter=18", "exposure=0.0004"]  # of the tank: what cannot be measured
 CASES = """
 camera_files_of_others: convert-cameras ros_camera_info.yaml --out ros.yaml
 camera_files_of_others: convert-cameras anipose.toml --out anipose.yaml

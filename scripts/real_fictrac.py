@@ -150,7 +150,7 @@ def compare_turns(ours: torch.Tensor, source: Path) -> None:
 
 def compare_attitudes(R_lab_body: torch.Tensor, source: Path) -> None:
     """Print differences of absolute attitudes along the movie, after the best rotation on both sides."""
-    print("absolute attitude, best constant rotations taken off:")
+    print("absolute attitude, after the best constant rotations:")
     valid = torch.isfinite(R_lab_body).flatten(1).all(1)
     for q in reversed(FACTORS):
         theirs = torch.from_numpy(np.loadtxt(source / f"fictrac_q{q}.dat", delimiter=",")[:, FICTRAC["rotation_cam"]])

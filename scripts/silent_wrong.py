@@ -403,7 +403,7 @@ CASES = (
     ),
     Case(
         name="rolled_cam2_1.5",
-        what="the second camera turned about its axis",
+        what="the second camera rotated about its axis",
         measurable=False,
         reported=turned("cam2", 1.5, 2),
     ),
