@@ -76,8 +76,8 @@ def write_card(source: Path, out: Path, first: int, last: int) -> None:
     files = sorted(path for path in out.iterdir() if path.name != "card.json")
     card = {
         "what": f"frames {first} .. {last - 1} of two cameras filming a painted sphere in a mixer, with exact truth",
-        "origin": "path traced with Mitsuba 3 from geometry written for this project's tests; nothing of sphereorient "
-        "took part in the pictures; no third-party content",
+        "origin": "path traced with Mitsuba 3 from geometry written for this project's tests; made without "
+        "sphereorient; no third-party content",
         "licence": "MIT, as the project",
         "made_by": "scripts/make_excerpt.py",
         "source_sha256": {
