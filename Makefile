@@ -2,7 +2,7 @@
 # TORCH_INDEX: on a machine without a GPU, give pip the address of torch's CPU builds here to avoid the CUDA packages.
 PYTHON ?= python3
 TORCH_INDEX ?=
-# Threads that wait for a core must not burn it: see cli.main.
+# Waiting threads must not occupy a core: see cli.main.
 export OMP_WAIT_POLICY ?= PASSIVE
 VENV := .venv
 BIN := $(VENV)/bin
@@ -29,7 +29,7 @@ test: setup
 test-all: setup
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal
 
-# tests/portable/sitecustomize.py hides them from every process.
+# tests/portable/sitecustomize.py hides the posix modules from every process.
 test-portable: setup
 	PYTHONPATH=tests/portable $(BIN)/python -m pytest -q -m "not slow" -n 2 --dist worksteal
 
@@ -48,7 +48,7 @@ docs: setup
 	$(BIN)/python -m pip install -q $(INDEX) -e '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
-# The tables and figures of the docs that are older than the code that they measure: hours where all are.
+# The tables and figures of the docs that are older than the code that they measure: hours for all.
 figures: setup
 	$(BIN)/python scripts/figures.py
 

@@ -1,13 +1,13 @@
-"""Measure what docs/accuracy.md states: errors of a method against exact truth.
+"""Measure the errors of docs/accuracy.md: a method against exact truth.
 
     scripts/accuracy.py EXPERIMENT_FOLDER [...] [--method precise] [--no-synth] [--windows 48]
                         [--benchmark RESULTS.json]
 
 Each folder holds experiment.yaml and truth.h5. Tracks it with all cameras and with each alone; then three synthetic
-movies of other paints (seeded). Prints one Markdown table. With `paper` it has more columns, rms values over those of
-the truth: the rates' errors by the kernels, applied to the true poses; the rest, which is noise; its sigmas.
-A sentence: are the stated errors honest, in all these movies and in the scenes of a robustness benchmark? A second
-table: the scenes with fewer than 95 %.
+movies of other paints (seeded). Prints one Markdown table. With `paper` the table has more columns, rms values over
+those of the truth: the errors that the kernels cause in the rates, the noise, the stated sigmas. A sentence states the
+share of frames inside the stated errors, of these movies and of the scenes of a robustness benchmark. A second table
+lists the scenes with fewer than 95 %.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def main() -> None:
     parser.add_argument("--method", default=DEFAULT_METHOD)
     parser.add_argument("--no-synth", action="store_true")
     parser.add_argument("--benchmark", type=Path, help="results.json of `sphereorient bench robustness`")
-    parser.add_argument("--windows", type=int, help="track so many frames in a row, each by itself, all cameras only")
+    parser.add_argument("--windows", type=int, help="track parts of this many frames, all cameras only")
     arguments = parser.parse_args()
     columns = COLUMNS + PAPER * (arguments.method == "paper")
     print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns))
@@ -79,16 +79,16 @@ def main() -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Stated:
-    """How honest the errors are that a track states."""
+    """Agreement of a track's stated errors with its errors."""
 
     pictures: str
-    frames: int  # that state an error of the orientation
+    frames: int  # with a stated error of the orientation
     inside: int  # of these, with the truth in the stated 95 % region
     over: float  # rms error over the stated sigmas
 
 
 def honesty(movies: Sequence[Stated], cells: Sequence[Stated]) -> str:
-    """Word the share of truths inside, of all together; tabulate the cells of the benchmark with fewer than 95 %."""
+    """Return the share of truths inside as a sentence, and a table of the benchmark's cells with fewer than 95 %."""
     frames, inside = (sum(getattr(one, key) for one in (*movies, *cells)) for key in ("frames", "inside"))
     lines = ["", f"**{100 * inside / max(frames, 1):.1f} % of {frames} truths lie in the stated 95 %.**"]
     low = [one for one in cells if one.inside < 0.95 * one.frames]
@@ -104,7 +104,7 @@ def honesty(movies: Sequence[Stated], cells: Sequence[Stated]) -> str:
 
 
 def of_benchmark(results: Path, method: str) -> list[Stated]:
-    """Return the honesty of each degradation at each level, of all seeds together."""
+    """Return the agreement of stated errors for each degradation and level, over all seeds."""
     found = load_results(results)
     cells: dict[tuple[str, int], list[SceneResult]] = {}
     for one in found.outcomes:
@@ -134,13 +134,13 @@ def windows(folder: Path, experiment: Experiment, count: int, method: str) -> li
 def measured(
     folder: Path, label: str, cameras: Sequence[str], method: str, frames: tuple[int, int] | None = None
 ) -> Stated:
-    """Track one movie, print its errors as a row of the table, and return how honest they are."""
+    """Track one movie, print its errors as a row of the table, and return the agreement of its stated errors."""
     experiment = replace(load_experiment(folder / "experiment.yaml"), frames=frames)
     begin = time.perf_counter()
     track = track_movies(experiment, method=method, cameras=cameras)
     seconds = time.perf_counter() - begin
     score = score_track(track, folder / "truth.h5")
-    inside, told = score.inside()
+    inside, count = score.inside()
     error = score.orientation_deg[score.valid]
     position = score.percentiles_mm()
     cells = [
@@ -153,17 +153,17 @@ def measured(
         _share(score, "alpha_lab"),
         _share(score, "velocity") if len(cameras) == 2 else "",
         " / ".join(f"{value:.2f}" if np.isfinite(value) else "–" for value in score.over_stated()),
-        f"{inside}" if inside == told else f"{inside} of {told}",
+        f"{inside}" if inside == count else f"{inside} of {count}",
         f"{seconds:.0f}",
     ]
     if method == "paper":
         cells += parts(track, folder / "truth.h5") if len(cameras) == 2 else [""] * len(PAPER)
     print("| " + " | ".join(cells) + " |", flush=True)
-    return Stated(pictures=label, frames=told, inside=inside, over=score.over_stated()[0])
+    return Stated(pictures=label, frames=count, inside=inside, over=score.over_stated()[0])
 
 
 def parts(track: Trajectory, truth_path: Path) -> list[str]:
-    """Return rms values of PARTS over the truth's: errors by kernels, noise, its sigmas, rates; smooth poses."""
+    """Return rms values of PARTS over the truth's: errors by kernels, noise, stated sigmas, rates; smooth poses."""
     with h5py.File(truth_path) as file:
         true = {name: file[name][: len(track)] for name in ("position", "orientation", *PARTS)}
     position, R, segment = (torch.from_numpy(x) for x in (true["position"], true["orientation"], track.segment))

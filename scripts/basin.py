@@ -1,10 +1,11 @@
-"""From how far the fit finds home: share of starts that arrive, by the angle they are off and the width of detail.
+"""Measure the basin of the fit: share of starts that converge, by angle from the truth and width of detail.
 
     scripts/basin.py [--experiment FOLDER] [--every 2]
 
-Starts are the truth turned about random axes, on frames of the bundled excerpt (or of a folder with experiment.yaml
-and truth.h5), both cameras; each is fitted at one width of detail and then, as in a cold start, at the finer ones. It
-has arrived if it ends within half a degree. Beside it the covering angle of the search bank's grid. Prints Markdown.
+Starts are true orientations rotated about random axes, on frames of the bundled excerpt (or of a folder with
+experiment.yaml and truth.h5), both cameras. Each start is fitted at one width of detail and then, as in a cold start,
+at the finer ones. It has converged if it ends within half a degree. Prints Markdown, and the covering radius of the
+search bank's grid.
 """
 
 from __future__ import annotations
@@ -38,14 +39,14 @@ ARRIVED_DEG = 0.5
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--experiment", type=Path, default=REPO / "synthetic_data" / "excerpt")
-    parser.add_argument("--every", type=int, default=2, help="use each so many-th frame")
+    parser.add_argument("--every", type=int, default=2, help="use every n-th frame")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     settings, every = Settings(), arguments.every
     with open_recording(arguments.experiment / "experiment.yaml") as recording:
         numbers, texture, radius_mm = recording.frames, recording.texture, recording.experiment.radius_mm
         views = [open_views(recording, stream, settings, silent)[""] for stream in recording.streams]
-        shots = [
+        movies = [
             list(screened_frames(stream, view.background))[::every]
             for stream, view in zip(recording.streams, views, strict=True)
         ]
@@ -55,7 +56,7 @@ def main() -> None:
         )
     proposers = {view.name: GreySearch(texture, settings.search) for view in views}
     base = base_table(texture, widest_px(views))
-    taken = list(zip(*shots, strict=True))
+    taken = list(zip(*movies, strict=True))
     first = Initialiser(
         fitter=first_fitter(views, radius_mm, base, FIRST_BLUR_PX),
         proposers=proposers,
@@ -63,7 +64,7 @@ def main() -> None:
         candidates=settings.refine.candidates,
     )
     fitter = estimate_appearance(first, taken[:16], base, settings.refine).fitter
-    frames = [[shot.picture for shot in row] for row in taken]
+    frames = [[frame.picture for frame in row] for row in taken]
     use = torch.ones(len(frames), len(views), dtype=torch.bool)
     optics = fitter.optics
     levels = {"coarse": (optics.coarse, 8), "middle": (optics.middle, 8), "fine": (optics.fine, 8)}
@@ -82,7 +83,7 @@ def main() -> None:
             cells.append(f"{100 * float(arrived.double().mean()):.0f} %")
         name = list(levels)[first]
         print(f"| {name}, blur {levels[name][0].blur_px:.2f} px | " + " | ".join(cells) + " |", flush=True)
-    print(f"\nSearch bank of {settings.search.step_deg:g} degrees; at 12 no rotation is beyond 14.5 of a template.")
+    print(f"\nSearch bank of {settings.search.step_deg:g} degrees; at 12 every rotation is within 14.5 of a template.")
 
 
 if __name__ == "__main__":

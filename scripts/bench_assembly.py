@@ -33,7 +33,7 @@ def wall_s(work: Callable[[], object]) -> float:
 
 
 def gradient_s(path: Callable[[Tensor], SoftPath], cost: Tensor) -> float:
-    """Of the log of some marginals, through the soft path to the costs."""
+    """Return the seconds of a gradient of some log marginals, through the soft path to the costs."""
     cost = cost.detach().requires_grad_()
     soft = path(cost)
     loss = soft.marginals[:, 0].clamp_min(1e-12).log().sum()
@@ -41,7 +41,7 @@ def gradient_s(path: Callable[[Tensor], SoftPath], cost: Tensor) -> float:
 
 
 def rows(frames: int, width: int) -> dict[str, tuple[float, ...]]:
-    """Seconds of costs, shortest path, soft path and gradient, of each order."""
+    """Return the seconds of costs, shortest path, soft path and gradient, for each order."""
     rng = torch.Generator().manual_seed(0)
     R = so3.random_rotations((frames, width), generator=rng, dtype=torch.float64)
     score = torch.rand(frames, width, generator=rng, dtype=torch.float64)

@@ -29,16 +29,16 @@ from sphereorient.experiment import load_experiment
 
 
 def digest(path: Path) -> str:
-    """Return one word for all datasets of a track."""
-    told = hashlib.sha256()
+    """Return a digest of all datasets of a track."""
+    hasher = hashlib.sha256()
 
     def add(name: str, item: object) -> None:
         if isinstance(item, h5py.Dataset):
-            told.update(name.encode() + np.asarray(item[()]).tobytes())
+            hasher.update(name.encode() + np.asarray(item[()]).tobytes())
 
     with h5py.File(path, "r") as file:
         file.visititems(add)
-    return told.hexdigest()[:12]
+    return hasher.hexdigest()[:12]
 
 
 def errors(track: Path, truth: Path) -> str:
@@ -69,7 +69,7 @@ def main() -> None:
                 words = [sys.executable, "-m", "sphereorient.cli", "track", part.path, "--out", out, "-q", "-j", jobs]
                 begin = time.perf_counter()
                 process = subprocess.Popen(list(map(str, words)))
-                # wait4 tells the peak of this one child, and of those that it waited for itself.
+                # wait4 returns the peak of this child and of its own children.
                 _, status, usage = os.wait4(process.pid, 0)
                 seconds = time.perf_counter() - begin
                 print(

@@ -2,8 +2,8 @@
 
     scripts/bench_memory.py EXPERIMENT.yaml [--times 1 5]
 
-The movies are written as .npy into a temporary folder, each `times` times in a row: memory that grows with the
-movie's length shows. Prints one line a length; the whole process is measured, start-up included.
+The movies are written as .npy into a temporary folder, repeated `times` times, to show memory that grows with the
+length. Prints one line per length; the whole process is measured, start-up included.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def lengthened(experiment: Experiment, times: int, folder: Path) -> Path:
             "fortran_order": False,
             "shape": (times * len(movie), *movie.frame_shape),
         }
-        # Written piece by piece: a child's peak counts from what its parent held, and a map of the file would be held.
+        # Written in pieces: a child's peak starts at its parent's memory, which a mapped file would enlarge.
         with paths[name].open("wb") as file:
             np.lib.format.write_array_header_2_0(file, header)
             for _ in range(times):
@@ -56,7 +56,7 @@ def main() -> None:
             begin = time.perf_counter()
             command = [sys.executable, "-m", "sphereorient.cli", "track", path, "--out", folder / "track.h5", "-q"]
             process = subprocess.Popen(command)
-            # wait4 tells the peak of this one child; getrusage(RUSAGE_CHILDREN) would tell the largest of all so far.
+            # wait4 returns the peak of this child; getrusage(RUSAGE_CHILDREN) the largest of all children.
             _, status, usage = resource_of(process)
             frames = np.load(folder / f"{next(iter(experiment.movie_paths))}.npy", mmap_mode="r").shape[0]
             seconds = time.perf_counter() - begin
@@ -67,7 +67,7 @@ def main() -> None:
 
 
 def resource_of(process: subprocess.Popen[bytes]) -> tuple[int, int, resource.struct_rusage]:
-    """Wait for a process; its id, exit status and use of resources."""
+    """Wait for a process; return its id, exit status and use of resources."""
     return os.wait4(process.pid, 0)
 
 

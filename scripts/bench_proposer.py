@@ -2,11 +2,11 @@
 
     scripts/bench_proposer.py [--checkpoint FILE] [--pictures 2000] [--out out/proposer-bench]
 
-For each degradation of single pictures, at levels 3 to 5 in equal parts: how often the right orientation, within 10
-degrees, is among the first five candidates, with 95 % intervals, and CPU time per picture on one thread. Maps of the
-kinds that the network learnt from, with other seeds, and of one kind, strokes, that it has not seen. Then pictures with
-two or three degradations at once, and how well probabilities are calibrated. Writes docs/proposer-bench.csv and
-docs/proposer.png, and the table in docs/proposer.md. Half an hour on two cores.
+Measures for each degradation of single pictures, at levels 3 to 5 in equal parts: how often the right orientation,
+within 10 degrees, is among the first five candidates, with 95 % intervals, and CPU time per picture on one thread. Maps
+are of the kinds that the network learnt from, with other seeds, and of one kind that it has not seen, strokes. Then
+pictures with two or three degradations at once, and the calibration of the probabilities. Writes
+docs/proposer-bench.csv and docs/proposer.png, and the table in docs/proposer.md. Half an hour on two cores.
 """
 
 from __future__ import annotations
@@ -64,11 +64,11 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Found:
-    """What a method gave for some pictures."""
+    """Result of a method for some pictures."""
 
     right: Bools  # among the first five
     best: Bools  # the first one
-    said: NDArray[np.float64]  # score of the first one; NaN without one
+    score: NDArray[np.float64]  # of the first one; NaN without one
     seconds: float  # CPU
 
 
@@ -76,7 +76,7 @@ def main() -> None:
     """Read the options, run, write, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkpoint", type=Path, default=DEFAULT_CHECKPOINT)
-    parser.add_argument("--pictures", type=int, default=2000, help="of each degradation")
+    parser.add_argument("--pictures", type=int, default=2000, help="number for each degradation")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--docs", action="store_true", help="write the table and the picture into docs")
     parser.add_argument("--families", default=",".join((CLEAN, *DISK_DEGRADATIONS, MIXED)))
@@ -97,9 +97,9 @@ def main() -> None:
         for family in families
     }
     for family in families:
-        tell(family, found[family])
+        print_row(family, found[family])
     if MIXED in found:
-        tell_calibration(found[MIXED])
+        print_calibration(found[MIXED])
     if options.docs:
         write_docs(found)
 
@@ -110,7 +110,7 @@ def one_thread() -> None:
 
 
 class Smaller:
-    """A proposer that looks at disks with fewer pixels."""
+    """A proposer that searches disks with fewer pixels."""
 
     def __init__(self, proposer: Proposer, size_px: int) -> None:
         self._proposer, self.size_px = proposer, size_px
@@ -121,22 +121,22 @@ class Smaller:
 
 
 class Remembering:
-    """A proposer that answers once about the same pictures."""
+    """A proposer that keeps the candidates of its last pictures."""
 
     def __init__(self, proposer: Proposer) -> None:
         self._proposer, self.size_px = proposer, proposer.size_px
-        self._asked: Tensor | None = None
-        self._answer = Candidates.none(())
+        self._disks: Tensor | None = None
+        self._candidates = Candidates.none(())
 
     def propose(self, disks: Tensor, least: float | None = None) -> Candidates:
         """Propose for (F, S, S) disks."""
-        if disks is not self._asked:
-            self._answer, self._asked = self._proposer.propose(disks, least), disks
-        return self._answer
+        if disks is not self._disks:
+            self._candidates, self._disks = self._proposer.propose(disks, least), disks
+        return self._candidates
 
 
 def methods(texture: Tensor, checkpoint: Path) -> Iterator[tuple[str, Proposer]]:
-    """Yield what is compared."""
+    """Yield the proposers that are compared, with their names."""
     settings = GreySearchSettings()
     search = Remembering(GreySearch(texture, settings))
     yield "template search", search
@@ -153,25 +153,25 @@ def ball(number: int, families: Sequence[str], checkpoint: Path) -> dict[str, di
     """Film one ball with each family of degradations and let all methods propose."""
     rng = torch.Generator().manual_seed(FIRST_SEED + 1000 * number + 7)
     kind = KINDS[number % len(KINDS)]
-    told = strokes(ROWS, rng) if kind == "strokes" else random_texture(kind, FIRST_SEED + number, ROWS)
-    compared = dict(methods(told, checkpoint))
+    texture = strokes(ROWS, rng) if kind == "strokes" else random_texture(kind, FIRST_SEED + number, ROWS)
+    compared = dict(methods(texture, checkpoint))
     found = {}
     for family in families:
         R = so3.random_rotations(BALL, generator=rng).float()
-        pictures = filmed(told, R, family, rng)
-        found[family] = {name: asked(proposer, pictures, R) for name, proposer in compared.items()}
-        # The templates' answer was at hand.
+        pictures = filmed(texture, R, family, rng)
+        found[family] = {name: proposed(proposer, pictures, R) for name, proposer in compared.items()}
+        # The candidates of the templates were kept: their time is added.
         first = found[family]["template search"].seconds
         found[family]["both"] = replace(found[family]["both"], seconds=found[family]["both"].seconds + first)
     return found
 
 
-def filmed(told: Tensor, R: Tensor, family: str, rng: torch.Generator) -> Tensor:
-    """Film a ball, whose map is told, a third of the pictures at each level."""
+def filmed(texture: Tensor, R: Tensor, family: str, rng: torch.Generator) -> Tensor:
+    """Film a ball of this map, a third of the pictures at each level."""
     disks = []
     for share, level in zip(torch.tensor_split(R, len(LEVELS)), LEVELS, strict=True):
         values = drawn(family, level, rng)
-        paint = misdrawn(worn(told, values.get("paint_wear", 0.0), rng), values.get("texture_error", 0.0), rng)
+        paint = misdrawn(worn(texture, values.get("paint_wear", 0.0), rng), values.get("texture_error", 0.0), rng)
         disks.append(film_disks(paint, share, values, rng, DiskSettings()))
     return torch.cat(disks)
 
@@ -198,8 +198,8 @@ def strokes(height: int, rng: torch.Generator) -> Tensor:
     return white.float()
 
 
-def asked(proposer: Proposer, pictures: Tensor, R: Tensor) -> Found:
-    """Ask a method, and compare with the truth."""
+def proposed(proposer: Proposer, pictures: Tensor, R: Tensor) -> Found:
+    """Run a proposer, and compare its candidates with the truth."""
     begin = time.process_time()
     proposals = proposer.propose(pictures)
     seconds = time.process_time() - begin
@@ -207,7 +207,7 @@ def asked(proposer: Proposer, pictures: Tensor, R: Tensor) -> Found:
 
 
 def judged(proposals: Candidates, R: Tensor, seconds: float) -> Found:
-    """Say which pictures have the right orientation among their candidates."""
+    """Find the pictures with the right orientation among their candidates."""
     counts = proposals.offset.diff()
     frame = torch.repeat_interleave(torch.arange(len(R)), counts)
     place = torch.arange(len(frame)) - proposals.offset[:-1][frame]
@@ -216,9 +216,9 @@ def judged(proposals: Candidates, R: Tensor, seconds: float) -> Found:
     among, best = torch.zeros(len(R)), torch.zeros(len(R))
     among.index_add_(0, frame, (right & (place < FIRST)).float())
     best.index_add_(0, frame, (right & (place == 0)).float())
-    said = torch.full((len(R),), torch.nan, dtype=torch.float64)
-    said[counts > 0] = proposals.score[proposals.offset[:-1][counts > 0]]
-    return Found(right=(among > 0).numpy(), best=(best > 0).numpy(), said=said.numpy(), seconds=seconds)
+    score = torch.full((len(R),), torch.nan, dtype=torch.float64)
+    score[counts > 0] = proposals.score[proposals.offset[:-1][counts > 0]]
+    return Found(right=(among > 0).numpy(), best=(best > 0).numpy(), score=score.numpy(), seconds=seconds)
 
 
 def joined(parts: list[Found]) -> Found:
@@ -226,7 +226,7 @@ def joined(parts: list[Found]) -> Found:
     return Found(
         right=np.concatenate([part.right for part in parts]),
         best=np.concatenate([part.best for part in parts]),
-        said=np.concatenate([part.said for part in parts]),
+        score=np.concatenate([part.score for part in parts]),
         seconds=sum(part.seconds for part in parts),
     )
 
@@ -239,7 +239,7 @@ def interval(right: Bools) -> tuple[float, float, float]:
 
 
 def gain(one: Bools, other: Bools) -> tuple[float, float]:
-    """Return by how much the first is right more often on the same pictures, and half the 95 % interval of that."""
+    """Return the difference of two shares of right pictures, on the same pictures, and half its 95 % interval."""
     difference = one.astype(float) - other.astype(float)
     return float(difference.mean()), Z95 * float(difference.std()) / math.sqrt(len(difference))
 
@@ -257,25 +257,25 @@ def row(family: str, found: Mapping[str, Found]) -> list[str]:
     return cells
 
 
-def tell(family: str, found: Mapping[str, Found]) -> None:
-    """Print a line."""
+def print_row(family: str, found: Mapping[str, Found]) -> None:
+    """Print a row of the table."""
     print(" | ".join(row(family, found)), flush=True)
 
 
-def tell_calibration(found: Mapping[str, Found]) -> None:
+def print_calibration(found: Mapping[str, Found]) -> None:
     """Print how well the network's probabilities are calibrated."""
     print(calibration(found))
 
 
 def calibration(found: Mapping[str, Found]) -> str:
-    """Return a sentence."""
+    """Return a sentence about the calibration of the network."""
     one = found["network"]
-    known = np.isfinite(one.said)
-    said = probability_of(torch.from_numpy(one.said[known])).clamp(0, 1).numpy()
-    measured = reliability(said, one.best[known])
+    known = np.isfinite(one.score)
+    stated = probability_of(torch.from_numpy(one.score[known])).clamp(0, 1).numpy()
+    measured = reliability(stated, one.best[known])
     return (
         f"On {known.sum()} pictures with two or three degradations at once the network's first candidate is right in "
-        f"{100 * one.best[known].mean():.1f} %, claims {100 * said.mean():.1f} %; expected calibration "
+        f"{100 * one.best[known].mean():.1f} %, claims {100 * stated.mean():.1f} %; expected calibration "
         f"error {measured.error:.3f}, {measured.chance:.3f} by chance."
     )
 
@@ -295,8 +295,8 @@ def write_docs(found: Mapping[str, Mapping[str, Found]]) -> None:
     page = DOCS / "proposer.md"
     text = page.read_text("utf-8")
     head, tail = text.split(BEGIN)[0], text.split(END)[1]
-    said = f"\n\n{calibration(found[MIXED])}\n" if MIXED in found else "\n"
-    page.write_text(f"{head}{BEGIN}\n" + "\n".join(lines) + said + f"{END}{tail}", "utf-8")
+    sentence = f"\n\n{calibration(found[MIXED])}\n" if MIXED in found else "\n"
+    page.write_text(f"{head}{BEGIN}\n" + "\n".join(lines) + sentence + f"{END}{tail}", "utf-8")
     place = DOCS.parent / "out" / "proposer-bench"
     place.parent.mkdir(exist_ok=True)
     with writing(force=True):

@@ -2,9 +2,9 @@
 
     scripts/bench_robustness.py [--out out/robustness] [--full] [--jobs 2]
 
-The same as `sphereorient bench robustness`; besides, it writes docs/robustness.png, the table in docs/robustness.md and
-docs/robustness-baseline.json, with which later runs are compared, and prints where `precise` is not better than `paper`
-and how well the confidence is calibrated. Half an hour on two cores; an unfinished run goes on.
+Does the same as `sphereorient bench robustness`; also writes docs/robustness.png, the table in docs/robustness.md and
+docs/robustness-baseline.json, the reference of later runs, and prints where `precise` is not better than `paper`, and
+the calibration of the confidence. Half an hour on two cores; an interrupted run continues.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@
 Synthetic frames (one ball each, random attitude, noise 5 % of the step from black to white, outline half a pixel of 80
 and up to 1 % of the radius off) of three paints under three lights; then every frame of the experiments given, which
 hold experiment.yaml and truth.h5, with the outlines that `locate` finds. Times are CPU seconds of one thread, best
-quarter of the repetitions: other programs on the machine only ever make them longer.
+quarter of the repetitions, since other programs only make them longer.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from sphereorient.synth import SynthSettings, make_scene, random_texture, render
 from sphereorient.synth.scene import seeded
 from sphereorient.synth.write import default_cameras
 
-LIGHTS = {"even": 1.0, "lamps": 0.5, "one side dark": 0.05}  # share that comes evenly from everywhere
+LIGHTS = {"even": 1.0, "lamps": 0.5, "one side dark": 0.05}  # share of even light
 PATTERNS = {"blobs": 1, "patches": 2, "dots": 3}
 NOISE = 0.05
 RIGHT_DEG = 3.0
-CENTRE_PX, RADIUS_SHARE = 0.5, 0.01  # errors planted
+CENTRE_PX, RADIUS_SHARE = 0.5, 0.01  # planted errors
 
 Sample = tuple[np.ndarray, float, float, float, Tensor]  # picture, outline's u, v and radius (px), R_view_body
 
@@ -105,11 +105,11 @@ def on_experiment(folder: Path) -> None:
             (scene,) = find_scenes(recording, stream, whole.locate.background_frames, whole.locate).values()
             background, diameter_px = scene.background, scene.diameter_px
             disks, R_view_body = [], []
-            for k, shot in zip(recording.frames, screened_frames(stream, background), strict=True):
-                outline, _ = locate.find_ball(shot.picture, background, diameter_px, whole.locate)
+            for k, frame in zip(recording.frames, screened_frames(stream, background), strict=True):
+                outline, _ = locate.find_ball(frame.picture, background, diameter_px, whole.locate)
                 if outline is not None:
                     place = (outline.u_px, outline.v_px, outline.radius_px)
-                    disks.append(torch.from_numpy(crop_disk(shot.picture, *place, settings.size_px)))
+                    disks.append(torch.from_numpy(crop_disk(frame.picture, *place, settings.size_px)))
                     R_view_body.append(R_lab_view(stream.camera, *place[:2]).mT @ R_lab_body[k])
             report(f"{folder.name}, {stream.name}", search, torch.stack(disks), torch.stack(R_view_body))
 
@@ -129,7 +129,7 @@ def report(name: str, search: GreySearch, disks: Tensor, R_view_body: Tensor) ->
 
 
 def frames(paint: str, ambient: float, count: int) -> list[Sample]:
-    """Picture, outline (u, v, radius; errors planted) and R_view_body of random attitudes."""
+    """Return picture, outline (u, v, radius; with planted errors) and R_view_body at random attitudes."""
     settings = SynthSettings(
         diameter_px=80, image_size=(128, 128), ambient=ambient, shot_noise=0.0, read_noise=NOISE * (170 - 20)
     )

@@ -1,11 +1,11 @@
-"""Where the time goes: each stage of the precise method, against the paper's literal method and against its floor.
+"""Time each stage of the precise method, beside the paper's literal method and the cost of decoding.
 
     scripts/bench_speed.py EXPERIMENT_FOLDER [--frames 1200] [--fixed EXPERIMENT] [--long EXPERIMENT ...]
 
-`--fixed`: one camera before a ball in its place, frame by frame; `--long`: whole runs of these as well.
-CPU seconds of one thread for the stages, best of the repetitions, and wall seconds of the whole command in a fresh
-process. Other programs on the machine only ever make them longer: compare within one run. What is compiled is measured
-without it as well, five times in turn: median, and the least and largest. Prints Markdown.
+`--fixed`: one camera and a fixed ball, frame by frame; `--long`: whole runs of these experiments as well. Stages: CPU
+seconds of one thread, least of the repetitions. The whole command: wall seconds in a fresh process. Other programs on
+the machine make them longer: compare within one run. Compiled stages are also timed without compiled code, five times
+in turn: median, least and largest. Prints Markdown.
 """
 
 from __future__ import annotations
@@ -57,28 +57,28 @@ from sphereorient.search import GreySearch, crop_disk, extract_paint
 from sphereorient.sphere import load_texture, orthographic_view, reduced_texture
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
-TURNS, SMOOTHED = 5, 3000  # measurements in turn; frames of the smoother's
-FOLLOWED = 48  # frames over which one prediction after the other is timed
-MANY = 128  # the same of several balls
-TOLD = """
+TURNS, SMOOTHED = 5, 3000  # repetitions; frames of the smoother
+FOLLOWED = 48  # predicted frames in a row that are timed
+MANY = 128  # the same for several balls
+TIMED = """
 import json, sys, time
 begun = time.perf_counter()
 from sphereorient import track_movies
-told = []
-track = track_movies(sys.argv[1], progress=lambda *what: told.append((*what, time.perf_counter() - begun)))
+stages = []
+track = track_movies(sys.argv[1], progress=lambda *what: stages.append((*what, time.perf_counter() - begun)))
 pictures = len(track) * len(track.cameras)
 end = time.perf_counter() - begun
-print(json.dumps({"told": told, "end": end, "cpu": time.process_time(), "pictures": pictures}))
+print(json.dumps({"stages": stages, "end": end, "cpu": time.process_time(), "pictures": pictures}))
 """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bench:
-    """What the stages work on: the first frames of an experiment, and all that is learnt before."""
+    """Input of the stages: the first frames of an experiment, and everything learnt before them."""
 
     experiment: Experiment
     eyes: list[CameraView]
-    shots: list[list[Frame]]  # per eye
+    frames: list[list[Frame]]  # by camera
     times: list[float]  # of the same frames, s
     search: GreySearch
     learnt: Appearance
@@ -87,7 +87,7 @@ class Bench:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--frames", type=int, default=1200, help="of the runs of the repeated movies")
+    parser.add_argument("--frames", type=int, default=1200, help="length of the repeated movies")
     parser.add_argument("--fixed", type=Path)
     parser.add_argument("--long", type=Path, nargs="*", default=[])
     arguments = parser.parse_args()
@@ -110,12 +110,12 @@ def main() -> None:
         whole(str(path), path)
 
 
-def say(what: str, figure: str) -> None:
+def show(what: str, figure: str) -> None:
     print(f"| {what} | {figure} |", flush=True)
 
 
 def cpu_s(work: Callable[[], object], repetitions: int = 5) -> float:
-    """Least CPU seconds of some calls."""
+    """Return the least CPU seconds of some calls."""
     spent = []
     for _ in range(repetitions):
         begin = time.process_time()
@@ -124,8 +124,8 @@ def cpu_s(work: Callable[[], object], repetitions: int = 5) -> float:
     return min(spent)
 
 
-def told(values: list[float], scale: float = 1.0, digits: int = 2) -> str:
-    """Median, least and largest in words."""
+def spread(values: list[float], scale: float = 1.0, digits: int = 2) -> str:
+    """Return median, least and largest as text."""
     median, low, high = (
         f"{scale * value:.{digits}f}" for value in (statistics.median(values), min(values), max(values))
     )
@@ -159,27 +159,27 @@ def smoother() -> None:
         return (time.process_time() - begin) / SMOOTHED
 
     fast, slow = in_turn(passes)
-    say("smoother, there and back, compiled, CPU us a frame", told(fast, 1e6, 1))
-    say("the same in numpy", told(slow, 1e6, 1))
+    show("smoother, there and back, compiled, CPU us a frame", spread(fast, 1e6, 1))
+    show("the same in numpy", spread(slow, 1e6, 1))
 
 
-def prepared(folder: Path, cameras: list[str] | None = None, say: Callable[[str, str], None] = say) -> Bench:
+def prepared(folder: Path, cameras: list[str] | None = None, show: Callable[[str, str], None] = show) -> Bench:
     """Learn what the stages need, as the pipeline does."""
     settings = Settings()
     with open_recording(folder / "experiment.yaml", cameras) as recording:
         eyes = [open_views(recording, reel, settings, silent)[""] for reel in recording.streams]
-        shots = [
+        frames = [
             list(screened_frames(reel, eye.background, 0, FOLLOWED))
             for reel, eye in zip(recording.streams, eyes, strict=True)
         ]
         sampled, _ = sample_frames(recording, eyes, settings.refine.appearance_frames)
         for reel in recording.streams:
             decoding = cpu_s(lambda reel=reel: list(reel.pictures(0, 20)), 3) / 20
-            say(f"decoding {reel.name}, CPU ms a frame (floor of a movie)", f"{1e3 * decoding:.2f}")
+            show(f"decoding {reel.name}, CPU ms a frame (floor of a movie)", f"{1e3 * decoding:.2f}")
         texture, times = recording.texture, recording.timeline.time_s[:FOLLOWED].tolist()
         experiment, radius_mm = recording.experiment, recording.experiment.radius_mm
     search = GreySearch(texture, settings.search)
-    say("search bank, CPU s", f"{cpu_s(lambda: GreySearch(texture, settings.search), 2):.2f}")
+    show("search bank, CPU s", f"{cpu_s(lambda: GreySearch(texture, settings.search), 2):.2f}")
     base = base_table(texture, widest_px(eyes))
     proposers = {eye.name: search for eye in eyes}
     begin = time.process_time()
@@ -190,12 +190,12 @@ def prepared(folder: Path, cameras: list[str] | None = None, say: Callable[[str,
         candidates=settings.refine.candidates,
     )
     learnt = estimate_appearance(first, sampled, base, settings.refine)
-    say("appearance (light, blur, noise), CPU s", f"{time.process_time() - begin:.2f}")
-    return Bench(experiment=experiment, eyes=eyes, shots=shots, times=times, search=search, learnt=learnt)
+    show("appearance (light, blur, noise), CPU s", f"{time.process_time() - begin:.2f}")
+    return Bench(experiment=experiment, eyes=eyes, frames=frames, times=times, search=search, learnt=learnt)
 
 
 def initialiser(bench: Bench) -> Initialiser:
-    """Return who finds the sphere without history."""
+    """Return the initialiser with the learnt appearance."""
     return Initialiser(
         fitter=bench.learnt.fitter,
         proposers={eye.name: bench.search for eye in bench.eyes},
@@ -206,15 +206,15 @@ def initialiser(bench: Bench) -> Initialiser:
 
 
 def stages(bench: Bench) -> float:
-    """Time single frames: found from nothing, and predicted; return CPU s of a block's mean frame, a camera."""
+    """Time single frames, without history and predicted; return the CPU s of a block's mean frame, per camera."""
     settings, cameras = Settings(), len(bench.eyes)
-    first = [movie[0] for movie in bench.shots]
-    frames = [shot.picture for shot in first]
+    first = [movie[0] for movie in bench.frames]
+    frames = [frame.picture for frame in first]
     for eye, frame in zip(bench.eyes, frames, strict=True):
         seen = cpu_s(
             lambda eye=eye, frame=frame: locate.find_ball(frame, eye.background, eye.diameter_px, settings.locate)
         )
-        say(f"outline in a full frame, {eye.name}, CPU ms", f"{1e3 * seen:.1f}")
+        show(f"outline in a full frame, {eye.name}, CPU ms", f"{1e3 * seen:.1f}")
     outline, _ = locate.find_ball(frames[0], bench.eyes[0].background, bench.eyes[0].diameter_px, settings.locate)
     assert outline is not None
 
@@ -222,28 +222,28 @@ def stages(bench: Bench) -> float:
         disk = crop_disk(frames[0], outline.u_px, outline.v_px, outline.radius_px, bench.search.size_px)
         return bench.search.propose(torch.from_numpy(disk)[None])
 
-    say("first pose of a disk without history (crop, search, climb), CPU ms; bar 20", f"{1e3 * cpu_s(first_pose):.1f}")
+    show("first pose of a disk without history (crop, search, climb), CPU ms; bar 20", f"{1e3 * cpu_s(first_pose):.1f}")
     search = initialiser(bench)
     found = cpu_s(lambda: replace(search, score_min=0.0).poses(first))
-    say("frame without history, outlines to covariances, CPU ms a camera", f"{1e3 * found / cameras:.1f}")
+    show("frame without history, outlines to covariances, CPU ms a camera", f"{1e3 * found / cameras:.1f}")
     fast, slow = in_turn(lambda: predicted(bench))
     each, (short, _) = statistics.median(fast), steps(bench, settings.refine.chunks)
-    say("predicted frame, decoded already, with covariance, compiled, CPU ms a camera; bar 0.8", told(fast, 1e3))
-    say("the same in torch; bar: no slower than before, 4.3 to 5.0", told(slow, 1e3))
-    say("torch over compiled", told([b / a for a, b in zip(fast, slow, strict=True)]))
+    show("predicted frame, decoded already, with covariance, compiled, CPU ms a camera; bar 0.8", spread(fast, 1e3))
+    show("the same in torch; bar: no slower than before, 4.3 to 5.0", spread(slow, 1e3))
+    show("torch over compiled", spread([b / a for a, b in zip(fast, slow, strict=True)]))
     block = settings.refine.chunk_frames
     return (short + (block - 2) * each) / block
 
 
 def steps(bench: Bench, lanes: int) -> tuple[float, float]:
-    """CPU seconds a camera of a block's first two frames, and of a predicted one, as many blocks side by side."""
+    """Return CPU s per camera of a block's first two frames and of a predicted one, with blocks side by side."""
     ball = BallTracker(bench.learnt, initialiser(bench), Settings().refine.model_copy(update={"chunks": lanes}))
-    short, each = steps_of(Tracker({"": ball}), bench.shots, bench.times, lanes)
+    short, each = steps_of(Tracker({"": ball}), bench.frames, bench.times, lanes)
     return short / lanes / len(bench.eyes), each / lanes / len(bench.eyes)
 
 
-def steps_of(tracker: Tracker, shots: list[list[Frame]], times: list[float], lanes: int) -> tuple[float, float]:
-    """CPU seconds of the first two frames of all blocks side by side, and of a predicted one, median."""
+def steps_of(tracker: Tracker, frames: list[list[Frame]], times: list[float], lanes: int) -> tuple[float, float]:
+    """Return CPU s of the first two frames of all blocks side by side, and of a predicted one (median)."""
     at: list[float] = []
     real = tracker._step
 
@@ -253,14 +253,14 @@ def steps_of(tracker: Tracker, shots: list[list[Frame]], times: list[float], lan
 
     length = len(times) // lanes
     with mock.patch.object(tracker, "_step", step):
-        list(tracker.track([movie[: lanes * length] for movie in shots], [length] * lanes, times))
+        list(tracker.track([movie[: lanes * length] for movie in frames], [length] * lanes, times))
     at.append(time.process_time())
     # First frames are searched for, second ones approached.
     return at[2] - at[0], statistics.median(np.diff(at[2:]).tolist())
 
 
 def predicted(bench: Bench) -> float:
-    """CPU seconds a predicted frame, a camera."""
+    """Return the CPU s of a predicted frame, per camera."""
     return steps(bench, Settings().refine.chunks)[1]
 
 
@@ -273,14 +273,14 @@ def sizes() -> None:
             folder = Path(name) / "movie"
             write_synthetic_experiment(folder, settings)
             for cameras in (["cam1"], None):
-                bench = prepared(folder, cameras, say=lambda *_: None)
+                bench = prepared(folder, cameras, show=lambda *_: None)
                 spent = [predicted(bench) for _ in range(TURNS)]
                 what = f"predicted frame of {diameter_px} px, {len(bench.eyes)} camera(s), CPU ms a camera"
-                say(what, told(spent, 1e3))
+                show(what, spread(spent, 1e3))
 
 
 def three_balls() -> None:
-    """Time predicted frames of three balls that pass before each other, and of one of them."""
+    """Time predicted frames of three balls that occlude each other, and of one of them."""
     lanes, spent = Settings().refine.chunks, {}
     with tempfile.TemporaryDirectory() as name:
         for balls in (1, 3):
@@ -293,43 +293,43 @@ def three_balls() -> None:
                 job = Job(recording=recording, settings=Settings(), device=torch.device("cpu"))
                 follower = precise.learn(job, silent)
                 views = next(iter(follower.appearances.values())).fitter.views
-                shots = [
+                frames = [
                     list(screened_frames(reel, view.background, 0, MANY))
                     for reel, view in zip(recording.streams, views, strict=True)
                 ]
                 times = recording.timeline.time_s[:MANY].tolist()
-            spent[balls] = follower.tracker, shots, times
+            spent[balls] = follower.tracker, frames, times
         turns = [{n: steps_of(*of, lanes)[1] / (n * lanes * 3) for n, of in spent.items()} for _ in range(TURNS)]
     for balls in spent:
-        say(f"predicted frame, {balls} ball(s), CPU ms a ball and camera", told([one[balls] for one in turns], 1e3))
-    say("three balls over one; bar 1.2", told([one[3] / one[1] for one in turns]))
+        show(f"predicted frame, {balls} ball(s), CPU ms a ball and camera", spread([one[balls] for one in turns], 1e3))
+    show("three balls over one; bar 1.2", spread([one[3] / one[1] for one in turns]))
 
 
 def live(experiment: Path) -> None:
-    """Time one camera before a ball in its place, frame by frame, nothing ahead."""
+    """Time one camera and a fixed ball, frame by frame, without later frames."""
     settings = Settings()
     settings = settings.model_copy(update={"refine": settings.refine.model_copy(update={"chunks": 1})})
     with open_recording(experiment) as recording:
         job = Job(recording=recording, settings=settings, device=torch.device("cpu"))
         follower = precise.learn(job, silent)
         view, stream = follower.appearance.fitter.views[0], recording.streams[0]
-        shots = list(screened_frames(stream, view.background, 0, FOLLOWED))
+        frames = list(screened_frames(stream, view.background, 0, FOLLOWED))
         times = recording.timeline.time_s[:FOLLOWED].tolist()
     spent = []
     for _ in range(TURNS):
         ends = []
         for count in (2, FOLLOWED):
             begin = time.perf_counter()
-            list(follower.tracker.track([shots[:count]], [count], times[:count]))
+            list(follower.tracker.track([frames[:count]], [count], times[:count]))
             ends.append(time.perf_counter() - begin)
         spent.append((ends[1] - ends[0]) / (FOLLOWED - 2))
-    say("one camera, ball fixed, frame by frame, decoded, wall ms; bar 1.5", told(spent, 1e3))
+    show("one camera, ball fixed, frame by frame, decoded, wall ms; bar 1.5", spread(spent, 1e3))
 
 
 def literal(bench: Bench, mean_s: float) -> None:
     """Time the paper's literal search: 12 then 3 degrees, every template rendered at full size."""
     settings = Settings().orient
-    eye, frame = bench.eyes[0], bench.shots[0][0].picture
+    eye, frame = bench.eyes[0], bench.frames[0][0].picture
     outline, _ = locate.find_ball(frame, eye.background, eye.diameter_px, Settings().locate)
     assert outline is not None
     size_px = round(2 * outline.radius_px)
@@ -355,13 +355,13 @@ def literal(bench: Bench, mean_s: float) -> None:
             quality(R @ fine)
 
     paper = cpu_s(once, 1)
-    frames = [movie[0] for movie in bench.shots]
+    frames = [movie[0] for movie in bench.frames]
     search = replace(initialiser(bench), score_min=0.0)
     ours = cpu_s(lambda: search.poses(frames)) / len(bench.eyes)
-    say("the paper's literal search, full-size renderings, CPU s a camera and frame", f"{paper:.1f}")
-    say("ratio to a frame without history, outline and refinement included", f"{paper / ours:.0f}")
+    show("the paper's literal search, full-size renderings, CPU s a camera and frame", f"{paper:.1f}")
+    show("ratio to a frame without history, outline and refinement included", f"{paper / ours:.0f}")
     block = Settings().refine.chunk_frames
-    say(f"ratio to the mean frame of a block of {block}, refinement included; bar 100", f"{paper / mean_s:.0f}")
+    show(f"ratio to the mean frame of a block of {block}, refinement included; bar 100", f"{paper / mean_s:.0f}")
 
 
 def repeated(folder: Path, out: Path, count: int, kind: str) -> Path:
@@ -413,22 +413,22 @@ def whole(kind: str, experiment: Path) -> None:
         cold, warm = (in_process(experiment, kept) for _ in range(2))
     plain = in_process(experiment, {WITHOUT: "1", WITHOUT_CACHE: "1"})
     seconds = [f"{each['end']:.1f}, {each['cpu']:.1f}" for each in (cold, warm, plain)]
-    say(f"{kind}: whole run, wall and CPU s, cold cache; warm; without compiled code", "; ".join(seconds))
+    show(f"{kind}: whole run, wall and CPU s, cold cache; warm; without compiled code", "; ".join(seconds))
     begins, rates, joins = [], [], []
     for each in (cold, warm):
-        stages = {stage: at for stage, _, _, at in each["told"]}
-        tracked = [(done, at) for stage, done, _, at in each["told"] if stage == "track"]
+        stages = {stage: at for stage, _, _, at in each["stages"]}
+        tracked = [(done, at) for stage, done, _, at in each["stages"] if stage == "track"]
         begins.append(f"{next(at for done, at in tracked if done):.1f}")
         rates.append(f"{each['pictures'] / (stages['track'] - tracked[0][1]):.0f}")
         joins.append(f"{each['end'] - stages['track']:.1f}")
-    say(f"{kind}: start-up to the first batch tracked, wall s, cold; warm; bars 3.5, 2", "; ".join(begins))
-    say(f"{kind}: camera-frames per wall second of following; bars 180 (FFV1), 300 (24 slices), 600 (.npy)", rates[1])
-    say(f"{kind}: path, smoother and writing, wall s", joins[1])
+    show(f"{kind}: start-up to the first batch tracked, wall s, cold; warm; bars 3.5, 2", "; ".join(begins))
+    show(f"{kind}: camera-frames per wall second of following; bars 180 (FFV1), 300 (24 slices), 600 (.npy)", rates[1])
+    show(f"{kind}: path, smoother and writing, wall s", joins[1])
 
 
 def in_process(experiment: Path, environment: dict[str, str]) -> dict[str, Any]:
-    """Track in a fresh process; return when each stage was told."""
-    command = [sys.executable, "-c", TOLD, str(experiment)]
+    """Track in a fresh process; return when each stage reported progress."""
+    command = [sys.executable, "-c", TIMED, str(experiment)]
     run = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=os.environ | environment)
     return dict(json.loads(run.stdout))
 

@@ -1,15 +1,15 @@
-"""Compute the table of the Cramér-Rao bound by diameter and kind of paint, beside the figures it was specified with.
+"""Compute the table of the Cramér-Rao bound by diameter and kind of paint, beside the specified figures.
 
     scripts/bound_table.py [--experiment FOLDER]
 
-One picture, noise 5 % of the black-white step, optics sigma 0.55 px, background as dark as the black paint. Each
-figure is the root of the mean variance over several seeds of paint and random attitudes. Prints Markdown: orientation,
+One picture, noise 5 % of the black-white step, optics sigma 0.55 px, background as dark as the black paint. Each figure
+is the root of the mean variance over several seeds of paint and random attitudes. Prints Markdown: orientation,
 degrees, in brackets with centre and radius known; after the slash the ratio to the specification. 35 s of one core.
 
-Paint with twice the border has 0.7 times the bound, so the specification's figures hold for paint as fine as its own:
-blobs with as much border as the experiment's map, 34 dots spread evenly, and polygons of whose number nothing is known:
-100 were taken because 60, as synth has them, give figures 1.1 to 1.2 times as large. The paints of
-`sphereorient.synth` are coarser and follow at the end.
+Paint with twice the border has 0.7 times the bound, so the specified figures hold for paint as fine as the specified
+one: blobs with as much border as the experiment's map, 34 evenly spread dots, and polygons. The number of polygons is
+not specified: 100 are taken, as the 60 of synth give figures 1.1 to 1.2 times as large. The coarser paints of
+`sphereorient.synth` follow at the end.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from sphereorient.tools.design.bound import cramer_rao_bound
 
 SEEDS = 5
 HEIGHT = 512  # of the maps
-# Specified: diameter, then orientation and orientation with known place for each kind, centre for blobs.
+# Specified: diameter, then orientation and orientation with known position for each kind, centre for blobs.
 SPECIFIED = {
     20: ((0.287, 0.181), (0.282, 0.198), (0.257, 0.170), 0.029),
     40: ((0.089, 0.054), (0.093, 0.063), (0.084, 0.052), 0.018),
@@ -68,9 +68,9 @@ def main() -> None:
 
 
 def rms(textures: Sequence[Tensor], diameter_px: float) -> tuple[float, float, float]:
-    """Orientation, degrees, without and with known place, and centre, px: rms over maps and attitudes."""
+    """Return rms over maps and attitudes: orientation, degrees, without and with known position, and centre, px."""
     rng = torch.Generator().manual_seed(round(diameter_px))
-    # Larger disks show more of the paint's borders and scatter less; they also take longer.
+    # Bounds of larger disks scatter less, and take longer.
     attitudes = 3 if diameter_px <= 80 else 1
     bounds = [
         cramer_rao_bound(

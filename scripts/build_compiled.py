@@ -49,7 +49,7 @@ class Compiled(BuildHookInterface):
             except (OSError, subprocess.CalledProcessError) as error:
                 if wanted:
                     raise
-                print(f"{source} is not compiled for {kind} ({error}); slower code does its work", file=sys.stderr)
+                print(f"{source} is not compiled for {kind} ({error}); slower code is used", file=sys.stderr)
                 continue
             build_data["artifacts"].append(str(target))
             build_data["pure_python"] = False

@@ -4,7 +4,7 @@
 
 Exact perspective of a near camera, the ball anywhere in the picture, even light, no rounding. Each fit starts about 2
 degrees, 0.5 px and 0.5 px of radius off the truth. The bound is computed for the same attitudes in the same run, light
-known, from far away. Prints Markdown, one row a paint: rms errors and their ratios to the bound.
+known, from far away. Prints Markdown, one row per paint: rms errors and their ratios to the bound.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ def place_errors(seen: CleanSet, found: Poses) -> tuple[Tensor, Tensor]:
 
 
 def bound_of(texture: Tensor, seen: CleanSet) -> Bound:
-    """The bound at the attitudes in which the camera sees the ball."""
+    """Return the bound at the attitudes of the ball in the camera."""
     R_cam_body = seen.camera.R_cam_lab @ seen.R_lab_body
     R_view_body = R_cam_view(in_camera(seen, seen.position_lab_mm)).mT @ R_cam_body
     return cramer_rao_bound(
@@ -168,7 +168,7 @@ def root_mean(values: Tensor) -> float:
 
 
 def refined(texture: Tensor, seen: CleanSet, start: Poses) -> Poses:
-    """The project's refinement: two widths of detail, light and noise learnt from the fits, the finest once more."""
+    """Refine as the project does: two widths of detail, light and noise learnt from the fits, the finest once more."""
     step = WHITE - BLACK
     noise = NOISE_SHARE * step
     width, height = seen.camera.image_size

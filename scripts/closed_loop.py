@@ -1,8 +1,8 @@
-"""A closed loop that measures its own delay: scripts/closed_loop.py [PICTURES_A_SECOND [SECONDS]]
+"""Measure the delay of a closed loop: scripts/closed_loop.py [PICTURES_A_SECOND [SECONDS]]
 
-An animal that turns steadily stands on a rendered ball. Pictures go into memory as a camera's would, `sphereorient
-live` measures them, FicTrac's line comes over a socket, and the answer to it is the next picture: the ball turned back
-by a share of the heading. The loop holds the heading at TURN_DEG / GAIN, which shows that the answers are right.
+An animal on a rendered ball turns at a constant rate. Pictures are written into shared memory as by a camera,
+`sphereorient live` measures them and sends FicTrac's lines over a socket, and each line sets the next picture: the ball
+is rotated back by a share of the heading. The heading settles at TURN_DEG / GAIN if the measurements are right.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from sphereorient.synth.scene import digitise, expose, make_scene, seeded
 
 STILL = {"velocity_rms": 0.0, "volume_mm": 1e-3, "omega_rms": 4.0, "omega_time": 0.2, "exposure": 0.001}
 SETTINGS = SynthSettings(frames=60, frame_rate=100.0, image_size=(240, 200), diameter_px=90.0, **STILL)
-TURN_DEG, GAIN = 1.0, 0.1  # turn of the animal a picture; share of the heading that is turned back
-HEADING = 17  # place in the line, "FT" first
+TURN_DEG, GAIN = 1.0, 0.1  # turn of the animal per picture; share of the heading that is rotated back
+HEADING = 17  # index in the line, "FT" is 0
 
 
 def main(rate_hz: float = 50.0, seconds: float = 10.0) -> None:
@@ -37,7 +37,7 @@ def main(rate_hz: float = 50.0, seconds: float = 10.0) -> None:
         experiment, pictures = set_up(Path(place))
         rng, turned_deg, delay_s, heading_deg = seeded(1), 0.0, [], []
         lines.bind(("127.0.0.1", 0))
-        lines.settimeout(120)  # the set-up is studied first
+        lines.settimeout(120)  # the appearance is learnt first
         command = [sys.executable, "-m", "sphereorient.cli", "live", experiment, "--cameras", "cam1"]
         command += ["--source", f"shared:{place}/ring", "--to", f"udp:{lines.getsockname()[1]}"]
         with SharedFrames(Path(place) / "ring", pictures[0].size) as ring:  # 8 bit: a byte a pixel
@@ -59,7 +59,7 @@ def main(rate_hz: float = 50.0, seconds: float = 10.0) -> None:
 
 
 def set_up(folder: Path) -> tuple[str, list[np.ndarray]]:
-    """Write an experiment of a ball that stays in its place; return it and pictures of the ball, one a degree."""
+    """Write an experiment with a fixed ball; return it and a picture of the ball per degree."""
     write_synthetic_experiment(folder, SETTINGS)
     path = folder / "experiment.yaml"
     known = yaml.safe_load(path.read_text())

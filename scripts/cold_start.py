@@ -1,8 +1,8 @@
-"""How often a single frame, of which nothing is known, gets the right orientation: found, fitted, within 1 degree.
+"""Measure how often a single frame without history gets the right orientation: found, fitted, within 1 degree.
 
     scripts/cold_start.py [EXPERIMENT_FOLDER ...] [--frames 200]
 
-First frames of the project's own renderer, three paints, 5 % noise, random attitudes and places; then every frame of
+First frames of the project's own renderer, three paints, 5 % noise, random attitudes and positions; then every frame of
 the experiments given, which hold experiment.yaml and truth.h5. Each camera alone, light and blur learnt as in a track.
 Prints Markdown.
 """
@@ -54,7 +54,7 @@ def main() -> None:
 
 
 def report(name: str, errors: list[float]) -> None:
-    """One row; a frame without any pose counts as wrong."""
+    """Print one row; a frame without any pose counts as wrong."""
     right = sum(error <= RIGHT_DEG for error in errors)
     median = float(np.median(errors))
     share = 100 * right / len(errors)
@@ -64,19 +64,19 @@ def report(name: str, errors: list[float]) -> None:
 def errors_deg(
     view: CameraView, texture: Tensor, radius_mm: float, frames: list[np.ndarray], R_lab_body: Tensor
 ) -> list[float]:
-    """Find each frame by itself; infinite where nothing is found."""
+    """Return the error of each frame, found by itself; infinite where nothing is found."""
     settings = Settings()
     search = {view.name: GreySearch(texture, settings.search)}
     spread = spread_frames(range(len(frames)), settings.refine.appearance_frames)
     base = base_table(texture, view.diameter_px)
-    shots = [[Frame(shown=frames[k])] for k in spread]
+    samples = [[Frame(shown=frames[k])] for k in spread]
     first = Initialiser(
         fitter=first_fitter([view], radius_mm, base, FIRST_BLUR_PX),
         proposers=search,
         locating=settings.locate,
         candidates=settings.refine.candidates,
     )
-    learnt = estimate_appearance(first, shots, base, settings.refine)
+    learnt = estimate_appearance(first, samples, base, settings.refine)
     errors = []
     for frame, R in zip(frames, R_lab_body, strict=True):
         poses = replace(first, fitter=learnt.fitter, score_min=learnt.clear_score).poses([Frame(shown=frame)])
@@ -86,7 +86,7 @@ def errors_deg(
 
 
 def rendered(paint: str, seed: int, count: int, light: str, ambient: float) -> None:
-    """Frames of the project's own renderer."""
+    """Measure frames of the project's own renderer."""
     settings = SynthSettings(read_noise=0.05 * SynthSettings().white, shot_noise=0.0, ambient=ambient)
     camera = next(iter(default_cameras(settings).values()))
     texture = random_texture(paint, seed)
@@ -101,7 +101,7 @@ def rendered(paint: str, seed: int, count: int, light: str, ambient: float) -> N
 
 
 def rendered_eye(camera: Camera, settings: SynthSettings) -> CameraView:
-    """The camera before its even background, which is known."""
+    """Return the view of a camera with a known, even background."""
     width, height = camera.image_size
     even = np.full((height, width), settings.background, np.float32)
     background = Background(mean=even, noise=np.full_like(even, settings.read_noise), full_scale=255.0)
@@ -111,7 +111,7 @@ def rendered_eye(camera: Camera, settings: SynthSettings) -> CameraView:
 
 
 def measured(folder: Path) -> None:
-    """Every frame of an experiment, each camera by itself."""
+    """Measure every frame of an experiment, each camera by itself."""
     settings = Settings()
     with open_recording(folder / "experiment.yaml") as recording:
         frames = recording.frames

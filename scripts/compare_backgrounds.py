@@ -1,8 +1,8 @@
-"""Centre errors of the outline with the paper's plain mean as background, and with the ball left out of it.
+"""Measure the outline's centre error with the paper's background, a plain mean, and with the ball left out of it.
 
     scripts/compare_backgrounds.py EXPERIMENT_FOLDER
 
-Prints one line a camera and background: frames found, median, 95th percentile and maximum of the centre's error, px.
+Prints one line per camera and background: frames found, median, 95th percentile and maximum of the centre's error, px.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Track the bundled excerpt, compare it with its exact truth, and draw what came out.
+"""Track the bundled excerpt, compare it with its exact truth, and draw the result.
 
 scripts/demo.py [--out out/demo]
 """

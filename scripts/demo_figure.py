@@ -1,4 +1,4 @@
-"""The picture that comes with a track: what was seen, what was measured, how far it is from the truth."""
+"""Draw a track: frames, measured poses, and errors against the truth."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def demo_figure(track: Trajectory, experiment: Experiment, path: Path, score: Sc
     """Draw frames with the re-rendered sphere, outline and axes, the track with its angles, and the error.
 
     Args:
-        track: what was measured.
-        experiment: what it was measured from; movies and texture are opened.
+        track: the result.
+        experiment: the input; movies and texture are opened.
         path: of the PNG or PDF to write.
         score: errors against the truth, where it is known.
     """
@@ -42,7 +42,7 @@ def demo_figure(track: Trajectory, experiment: Experiment, path: Path, score: Sc
 
 
 def _frames_part(part: Any, track: Trajectory, experiment: Experiment) -> None:
-    """Per camera two rows: the crop with outline and body axes, and the sphere re-rendered at the measured attitude."""
+    """Draw two rows per camera: crops with outline and body axes, and the sphere re-rendered at the measured pose."""
     if experiment.texture_path is None:
         do = "draw the track of an experiment with a texture"
         raise ExperimentError(refusal(str(experiment.path), expected="a texture", got="none", do=do))
@@ -53,7 +53,7 @@ def _frames_part(part: Any, track: Trajectory, experiment: Experiment) -> None:
     with ExitStack() as opened:
         movies = {name: opened.enter_context(movie) for name, movie in open_movies(experiment, names).items()}
         frames = timeline(experiment, movies)
-        # By their times: the track may be of a part of the experiment.
+        # Matched by time: the track may cover a part of the experiment.
         at = np.abs(frames.time_s[:, None] - track.time[chosen]).argmin(0)
         for name, movie in movies.items():
             pictures[name] = movie.sample(frames.rows[name][at].tolist())
@@ -85,7 +85,7 @@ def _draw_sighting(axes: Any, picture: NDArray[Any], track: Trajectory, camera: 
     radius = seen.radius_px[k]
     axes.imshow(picture, cmap="gray", vmin=0, vmax=np.percentile(picture, 99.8), interpolation="nearest")
     _bare(axes)
-    if not np.isfinite(radius):  # this camera does not have the sphere: the whole picture shows why
+    if not np.isfinite(radius):  # no disk in this camera: the whole picture is shown
         return
     reach = 1.25 * radius
     axes.set(xlim=(u - reach, u + reach), ylim=(v + reach, v - reach))
@@ -121,7 +121,7 @@ def _bare(axes: Any) -> None:
 
 
 def _curves_part(part: Any, track: Trajectory, score: Score | None) -> None:
-    """The track in six dimensions, omega, and the errors."""
+    """Draw the track in six dimensions, omega, and the errors."""
     axes = part.subplots(2, 2, sharex=True)
     time_ms = 1e3 * track.time
     _curves(axes[0, 0], time_ms, track.position, "position, lab (mm)", ("x", "y", "z"))
@@ -166,7 +166,7 @@ def _errors(axes: Any, time_ms: NDArray[Any], score: Score) -> None:
 
 
 def _cameras_apart(axes: Any, time_ms: NDArray[Any], track: Trajectory) -> None:
-    """Without a truth: how far apart the two cameras are, or the score of the one."""
+    """Draw, without a truth, the distance of the two cameras' orientations, or the score of one camera."""
     seen = list(track.cameras.values())
     if len(seen) == 2:
         a, b = (torch.from_numpy(each.orientation) for each in seen)

@@ -1,5 +1,5 @@
-"""Print the words of each page of the docs and in all, and each sentence that stands twice; exit code 1 where one does,
-or where there are more than `MOST` words.
+"""Print the number of words of each page of the docs and in all, and each sentence that stands twice; exit code 1 if
+one does, or if there are more than `MOST` words.
 
 A word has a letter or a digit; code and tables count (`wc -w`, in brackets, counts the bars of tables, too).
 docs/history.md is left out of the sum. A sentence has six words or more; headings, code and tables have none.
@@ -13,7 +13,7 @@ from collections import defaultdict
 from pathlib import Path
 
 REPO = Path(__file__).resolve().parent.parent
-NOT_COUNTED = {"history.md"}  # what was, for those who ask
+NOT_COUNTED = {"history.md"}  # the record of earlier states
 WORDS_OF_A_SENTENCE = 6
 MOST = 38_000  # words
 

@@ -1,10 +1,10 @@
-"""Check on synthetic ensembles that the statistics are right and their intervals honest.
+"""Check on synthetic ensembles that the statistics are right and their intervals hold the truth.
 
     scripts/ensemble_coverage.py [--repetitions 100] [--processes 2] [--segments 300] [--mean-frames 150]
 
 Each repetition draws tracks whose true statistics are those of the paper's Table I (exponential durations, alpha of
 flatness 7.6, omega of 4), measures them with 0.1 degree and 0.05 mm of white noise, smooths them as the precise method
-does, and takes the statistics of what comes out. Prints by quantity and component: the mean ratio to the same ensemble
+does, and computes the statistics. Prints by quantity and component: the mean ratio to the same ensemble
 without noise, and in how many repetitions the 95 % interval held the nominal value; then the warnings at 2 degrees.
 15 s of one core a repetition.
 """
@@ -32,7 +32,7 @@ NOISE_DEG, ROUGH_DEG, NOISE_MM = 0.1, 2.0, 0.05
 WITHIN = 0.03  # recovery of each rms
 HELD = 90, 99  # of 100 repetitions
 FITTED = ("omega_lab", "alpha_lab")  # by the stretched exponential
-LONG = 2_000_000  # samples, for the a that a very long record has
+LONG = 2_000_000  # samples: they give the a of a very long record
 DRAWS = BootstrapSettings(resamples=1000)
 
 
@@ -94,7 +94,7 @@ def repeat(work: Work) -> Result:
 
 
 def same_frames(exact: Trajectory, ensemble: Ensemble) -> Ensemble:
-    """Return the noise-free ensemble of just those frames that are in another one."""
+    """Return the noise-free ensemble at the frames of another one."""
     rows = np.searchsorted(exact.time, ensemble.time_s - 0.5 * ensemble.step_s)
     return ensemble_of(exact.at(rows), SegmentSettings(min_frames=2))
 
@@ -112,7 +112,7 @@ def truths(spec: EnsembleSpec) -> dict[tuple[str, str, int], float]:
 
 
 def table(results: list[Result], truth: dict[tuple[str, str, int], float]) -> bool:
-    """Print what came out; return whether all of it is as it should be."""
+    """Print the results; return whether all are within the limits."""
     print("quantity      statistic component    nominal  ratio to no noise (mean, worst)  held")
     fine = True
     for key, value in truth.items():
@@ -132,7 +132,7 @@ def table(results: list[Result], truth: dict[tuple[str, str, int], float]) -> bo
 
 
 def warnings(spec: EnsembleSpec, degrees: float) -> list[str]:
-    """Return which quantities are warned of at a noise."""
+    """Return the quantities that have a warning at a noise."""
     track, _ = smoothed_track(draw_ensemble(spec, 0), degrees, NOISE_MM, 0)
     ensemble = ensemble_of(track)
     few = BootstrapSettings(resamples=100)
@@ -140,10 +140,9 @@ def warnings(spec: EnsembleSpec, degrees: float) -> list[str]:
 
 
 def let_through(spec: EnsembleSpec, known: ProcessNoise) -> dict[str, float]:
-    """Return by quantity what part of the smoother's stated variance is noise that it let through.
+    """Return by quantity the share of remaining noise in the smoother's stated variance.
 
-    The same motion is smoothed with and without noise, both as if there were noise; the difference is what comes
-    through.
+    The same motion is smoothed with and without noise, both by the model with noise; the difference is what remains.
     """
     true = draw_ensemble(spec, 10_001)
     noisy, _ = smoothed_track(true, NOISE_DEG, NOISE_MM, 10_001, known)
@@ -178,10 +177,10 @@ def main() -> None:
     print(file=sys.stderr)
     fine = table(results, truth)
     for quantity, part in let_through(spec, known).items():
-        print(f"{quantity}: {part:.2f} of the smoother's stated variance is noise that it let through")
+        print(f"{quantity}: {part:.2f} of the smoother's stated variance is remaining noise")
     for degrees in (NOISE_DEG, ROUGH_DEG):
         print(f"warned of at {degrees} degrees: {', '.join(warnings(spec, degrees)) or 'nothing'}")
-    print("all as it should be" if fine else "NOT all as it should be: see the arrows")
+    print("all within the limits" if fine else "NOT all within the limits: see the arrows")
 
 
 if __name__ == "__main__":

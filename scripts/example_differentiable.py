@@ -3,10 +3,10 @@
     scripts/example_differentiable.py [--steps 30] [--out docs/differentiable.png]
 
 Sixteen frames of two cameras are rendered by synth (bilinear paint, nine rays a pixel, optics, noise, 8 bits). The
-second camera is then told 0.3 degrees turned, and the map has black and white exchanged within 20 degrees of one point.
-Each evaluation fits four candidates a frame (each camera by itself, from near and from 60 degrees away), weighs them by
-the soft path, and compares both pictures with the expected pose; L-BFGS goes down the gradient in the camera's rotation
-and in the texels within 35 degrees of that point. docs/differentiable.md walks through it.
+given second camera is rotated by 0.3 degrees; the given map has black and white exchanged within 20 degrees of a point.
+Each evaluation fits four candidates a frame (each camera by itself, from near and from 60 degrees away), weights them
+by the soft path, and compares both pictures with the expected pose. L-BFGS minimises the loss over the camera's
+rotation and the texels within 35 degrees of that point. docs/differentiable.md explains the steps.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ import matplotlib.pyplot as plt
 REPO = Path(__file__).resolve().parents[1]
 FRAMES, MAP_HEIGHT = 16, 32
 SCENE = SynthSettings(diameter_px=60.0, image_size=(74, 74), blur_px=1.0, read_noise=2.0)
-NOISE, RIM_NOISE = 3.5, 15.0  # grey levels; near the limb the paint is squeezed together, and the model too simple
+NOISE, RIM_NOISE = 3.5, 15.0  # grey levels; near the limb the paint is foreshortened, and the model too simple
 RIM = (0.85, 1.05)  # radii
-TOLD_WRONG_DEG = (0.12, 0.25, -0.11)  # of the second camera, about its own x, y, z: 0.3 in all
+GIVEN_WRONG_DEG = (0.12, 0.25, -0.11)  # of the second camera, about its own x, y, z: 0.3 in all
 SPOT_AT, SPOT_DEG = (0.2, -0.9, 0.4), 20.0  # body; where the map is wrong
-DOUBT_DEG = 35.0  # texels as near to that are free; the others hold the map to the ball
+DOUBT_DEG = 35.0  # texels within it of that point are free; the others fix the body frame
 UNIT_DEG = 1.0  # of the angles in the descent: makes the loss about as curved along them as along texels
 TURN_DEG = (3.0, -2.0, 7.0)  # from frame to frame, lab
 EVERY_PX = 2  # every second pixel across and down is compared
-OUTLINE_PX, PLACE_MM = 0.03, 0.01  # standard deviations of the balls' middles as located, and of the place that gives
+OUTLINE_PX, PLACE_MM = 0.03, 0.01  # standard deviations of located centres, and of the position from them
 LOOKS = ([[1, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 1, 0], [0, 0, -1], [-1, 0, 0]])  # along lab +y, along lab -x
 OWN = (0, 1, 0, 1)  # which camera each candidate of a frame is fitted to
 
@@ -58,12 +58,12 @@ def f64(value: object) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Movie:
-    """What was filmed, and how it really was."""
+    """The pictures and their truth."""
 
     grey: Tensor  # (N, 2, P), grey levels of the pixels compared
-    noise: Tensor  # (N, 2, P), grey levels, by which the model may miss them
-    uv_px: Tensor  # (P, 2), which these are
-    middle_px: Tensor  # (2, N, 2), where the outlines say that the ball is
+    noise: Tensor  # (N, 2, P), grey levels, standard deviation of the residuals
+    uv_px: Tensor  # (P, 2), these pixels
+    middle_px: Tensor  # (2, N, 2), centres of the outlines
     cameras: tuple[PinholeCamera, PinholeCamera]  # true
     texture: Tensor  # (H, 2 H), true
     R_lab_body: Tensor  # (N, 3, 3), true
@@ -130,7 +130,7 @@ def ball_of(texture: Tensor) -> PaintedBall:
 
 
 def sight_lines(movie: Movie, cameras: tuple[PinholeCamera, PinholeCamera]) -> Rays:
-    """Lines of sight of all pixels compared, (2, P, 3)."""
+    """Return the lines of sight of all pixels compared, (2, P, 3)."""
     both = [camera.rays(movie.uv_px) for camera in cameras]
     return Rays(
         origin_lab_mm=torch.stack([rays.origin_lab_mm for rays in both]),
@@ -139,20 +139,20 @@ def sight_lines(movie: Movie, cameras: tuple[PinholeCamera, PinholeCamera]) -> R
 
 
 def located(movie: Movie, cameras: tuple[PinholeCamera, PinholeCamera]) -> Tensor:
-    """Places (N, 3), lab, mm, of the ball's outlines."""
+    """Return positions (N, 3), lab, mm, from the ball's outlines."""
     first, second = (camera.rays(uv_px) for camera, uv_px in zip(cameras, movie.middle_px, strict=True))
     return triangulate(first, second)[0]
 
 
 def misfit(movie: Movie, sight: Rays, ball: PaintedBall, position_lab_mm: Tensor, R_lab_body: Tensor) -> Tensor:
-    """Residuals of both pictures at poses (N, ...), in units of the noise, (N, 2, P)."""
+    """Return residuals of both pictures at poses (N, ...), in units of the noise, (N, 2, P)."""
     return (expected_grey(sight, position_lab_mm[:, None], R_lab_body[:, None], ball) - movie.grey) / movie.noise
 
 
 def fit_candidates(
     movie: Movie, sight: Rays, ball: PaintedBall, start: tuple[Tensor, Tensor], place: Tensor, iterations: int
 ) -> ImplicitPose:
-    """Fit every candidate (N * C) to its own camera's pictures, and to the place within its error."""
+    """Fit every candidate (N * C) to its own camera's pictures, and to the position within its error."""
     own = torch.tensor(OWN)
     rays = Rays(origin_lab_mm=sight.origin_lab_mm[own], direction_lab=sight.direction_lab[own])
     seen, noise, known = movie.grey[:, own], movie.noise[:, own], place[:, None]
@@ -166,7 +166,7 @@ def fit_candidates(
 
 
 def track_of(movie: Movie, fitted: ImplicitPose) -> SoftTrack:
-    """Weigh the candidates: half the mean squared residual each, and the turns between the frames."""
+    """Weight the candidates by half their mean squared residual and by the rotations between frames."""
     shape = (FRAMES, len(OWN))
     pixels = movie.grey.shape[-1]
     return soft_track(
@@ -180,7 +180,7 @@ def track_of(movie: Movie, fitted: ImplicitPose) -> SoftTrack:
 
 
 def starts(movie: Movie) -> tuple[Tensor, Tensor]:
-    """Return where the candidates begin, as a search would leave them: 1.5 and 60 degrees off."""
+    """Return starts of the candidates as a search would give them: 1.5 and 60 degrees off."""
     rng = torch.Generator().manual_seed(5)
 
     def off(degrees: float) -> Tensor:
@@ -192,7 +192,7 @@ def starts(movie: Movie) -> tuple[Tensor, Tensor]:
 
 
 def picture_loss(movie: Movie, sight: Rays, ball: PaintedBall, track: SoftTrack) -> Tensor:
-    """Half the mean squared residual of both cameras' pictures at the expected poses; lost frames left out."""
+    """Return half the mean squared residual of both cameras' pictures at the expected poses, without lost frames."""
     there = track.marginals.detach().sum(-1) > 0
     seen = replace(movie, grey=movie.grey[there], noise=movie.noise[there])
     r = misfit(seen, sight, ball, track.position_lab_mm[there], track.R_lab_body[there])
@@ -200,30 +200,30 @@ def picture_loss(movie: Movie, sight: Rays, ball: PaintedBall, track: SoftTrack)
 
 
 class Descent:
-    """What is known of the second camera and of the paint, and the loss of it; each call goes on from the last fit."""
+    """Estimate of the second camera and of the paint, and its loss; each call starts from the last fit."""
 
     def __init__(self, movie: Movie) -> None:
         self.movie = movie
         away = map_directions(MAP_HEIGHT) @ torch.nn.functional.normalize(f64(SPOT_AT), dim=0)
         self.spot, self.doubt = (away > math.cos(math.radians(degrees)) for degrees in (SPOT_DEG, DOUBT_DEG))
-        self.told = torch.where(self.spot, 1.0 - movie.texture, movie.texture)
-        self.texels = self.told[self.doubt].requires_grad_()
-        # Of the second camera, on top of the truth: to become 0.
-        self.turn = (f64(TOLD_WRONG_DEG) / UNIT_DEG).requires_grad_()
+        self.given = torch.where(self.spot, 1.0 - movie.texture, movie.texture)
+        self.texels = self.given[self.doubt].requires_grad_()
+        # Error of the second camera's rotation: converges to 0.
+        self.turn = (f64(GIVEN_WRONG_DEG) / UNIT_DEG).requires_grad_()
         self.start, self.iterations = starts(movie), 30
         self.seen: list[tuple[float, float, float, float]] = []  # loss, degrees, texels, degrees of the track
 
     @property
     def texture(self) -> Tensor:
-        """The map (H, 2 H) as it is believed to be."""
-        return self.told.masked_scatter(self.doubt, self.texels)
+        """Return the estimated map (H, 2 H)."""
+        return self.given.masked_scatter(self.doubt, self.texels)
 
     def loss(self) -> Tensor:
-        """Fit, weigh, compare."""
+        """Return the loss: fit, weight, compare."""
         movie = self.movie
-        told = with_parameters(movie.cameras[1], ROTATION, torch.deg2rad(UNIT_DEG * self.turn))
-        sight, ball = sight_lines(movie, (movie.cameras[0], told)), ball_of(self.texture)
-        place = located(movie, (movie.cameras[0], told))
+        given = with_parameters(movie.cameras[1], ROTATION, torch.deg2rad(UNIT_DEG * self.turn))
+        sight, ball = sight_lines(movie, (movie.cameras[0], given)), ball_of(self.texture)
+        place = located(movie, (movie.cameras[0], given))
         fitted = fit_candidates(movie, sight, ball, self.start, place, self.iterations)
         self.start, self.iterations = (fitted.R_lab_body.detach(), fitted.position_lab_mm.detach()), 8
         track = track_of(movie, fitted)
@@ -240,7 +240,7 @@ class Descent:
 
 
 def recover(steps: int = 30) -> Descent:
-    """Go down the gradient: L-BFGS, which asks for nothing but losses and gradients."""
+    """Minimise the loss by L-BFGS."""
     descent = Descent(film())
     optimiser = torch.optim.LBFGS(
         [descent.texels, descent.turn],
@@ -262,7 +262,7 @@ def recover(steps: int = 30) -> Descent:
 
 
 def draw(descent: Descent, out: Path) -> None:
-    """Loss, angle and paint by evaluation, and the map told, recovered and true."""
+    """Draw loss, angle and paint by evaluation, and the given, recovered and true map."""
     loss, angle_deg, texels, _ = (np.array(column) for column in zip(*descent.seen, strict=True))
     figure = plt.figure(figsize=(11, 6.4), layout="constrained")
     grid = figure.add_gridspec(2, 3)
@@ -282,8 +282,8 @@ def draw(descent: Descent, out: Path) -> None:
         else:
             axes.set_ylim(0, 1.15 * curve.max())
         axes.grid(alpha=0.3)
-    maps = (descent.told, descent.texture.detach(), descent.movie.texture)
-    for k, (texture, title) in enumerate(zip(maps, ("map as told", "map recovered", "true map"), strict=True)):
+    maps = (descent.given, descent.texture.detach(), descent.movie.texture)
+    for k, (texture, title) in enumerate(zip(maps, ("map as given", "map recovered", "true map"), strict=True)):
         axes = figure.add_subplot(grid[1, k])
         axes.imshow(texture, cmap="gray", vmin=0, vmax=1, extent=(-180, 180, -90, 90))
         for area, color in ((descent.spot, "C3"), (descent.doubt, "C1")):

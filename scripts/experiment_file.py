@@ -1,4 +1,4 @@
-"""Experiments as files: what scripts and tests change of one is written as another experiment.yaml."""
+"""Write changed experiments as another experiment.yaml, for scripts and tests."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sphereorient.files.yaml_file import write_document
 
 
 def write_experiment(experiment: Experiment) -> Path:
-    """Write an experiment, without its cameras, to its `path`, which is returned; OutputError if that fails."""
+    """Write an experiment, without its cameras, to its `path`; return the path. OutputError if that fails."""
 
     def relative(path: Path | str) -> str:
         return relative_path(path, experiment.folder)

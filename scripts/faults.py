@@ -1,11 +1,11 @@
-"""What each fault of a movie costs: frames before and after, their reasons, and what good frames lose.
+"""Measure the cost of each fault of a movie: frames before and after, their reasons, and lost good frames.
 
     scripts/faults.py [--frames 96] [--turn 3] [--only NAME ...] [--json]
 
-A synthetic movie is spoilt in one way after the other and tracked twice: with what the clean run had learnt (then the
-orientations by each camera of the blocks without a fault are the same to the last bit, and positions to a millionth of
-a mm: the smoothed path sets where in the exposure they are) and with everything learnt anew from the spoilt movie (then
-poses differ by the tenths of a sigma that the last columns tell).
+Each fault is planted in a synthetic movie, which is tracked twice. First with the appearance of the clean run: each
+camera's orientations in blocks without a fault are then the same to the last bit, and positions to a millionth of a mm
+(the smoothed path sets their instant within the exposure). Then with everything learnt from the spoilt movie: poses
+differ by tenths of a sigma (last columns).
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ BLOCK = 16  # frames; short, so that a short movie has blocks without the fault
 RATE = 600.0
 CAMERAS = ("cam1", "cam2")
 Pictures = dict[str, NDArray[np.uint8]]
-SAME_MM = 1e-6  # of positions: where they are in the exposure follows the smoothed path
-# Orientations follow the path of all positions, and stated errors the disagreement of the cameras in the whole movie.
+SAME_MM = 1e-6  # of positions: the smoothed path sets their instant within the exposure
+# Orientations depend on the path of all positions, stated errors on the cameras' disagreement in the whole movie.
 SEEN = ("score", "centre_px", "orientation", "orientation_cov")
 
 
@@ -122,7 +122,7 @@ def drift(scene: Scene) -> Spoilt:
 
 
 def dropped(scene: Scene) -> Spoilt:
-    """Of each camera 30 % of the frames are black."""
+    """30 % of each camera's frames are black."""
     draw = np.random.default_rng(30)
     pictures = {name: movie.copy() for name, movie in scene.pictures.items()}
     bad: set[int] = set()
@@ -134,7 +134,7 @@ def dropped(scene: Scene) -> Spoilt:
 
 
 def dropped_stamped(scene: Scene) -> Spoilt:
-    """Each camera lost 30 % of its pictures; what is left carries time stamps."""
+    """Each camera lost 30 % of its pictures; the others have time stamps."""
     draw = np.random.default_rng(31)
     total = len(scene.R_lab_body)
     kept = {name: np.sort(draw.choice(total, total - int(0.3 * total), replace=False)) for name in CAMERAS}
@@ -145,7 +145,7 @@ def dropped_stamped(scene: Scene) -> Spoilt:
                 file["frames"], file["time"] = movie[kept[name]], kept[name] / RATE
         return {name: f"{name}.h5" for name in pictures}
 
-    there = np.union1d(*kept.values())  # instants that nobody saw are no frames
+    there = np.union1d(*kept.values())  # instants without a picture are no frames
     bad = [k for k, frame in enumerate(there.tolist()) if not all(frame in rows for rows in kept.values())]
     spoilt = Spoilt(dict(scene.pictures), bad, {"frame_rate": None, "times": "movies"}, write)
     spoilt.keys["there"] = there
@@ -182,7 +182,7 @@ def damaged(scene: Scene) -> Spoilt:
 
 
 def spoil_packets(path: Path, frames: list[int]) -> None:
-    """Turn some bytes in the middle of frames of a movie."""
+    """Change some bytes in the middle of frames of a movie."""
     import av
 
     with av.open(str(path)) as container:
@@ -263,7 +263,7 @@ def tracked(
 
 
 def compared(clean: Trajectory, track: Trajectory, rows: NDArray[np.int64]) -> tuple[bool, float, float]:
-    """Whether two tracks are the same in some frames, and by how many sigmas they differ: rms, most."""
+    """Return whether two tracks are the same in some frames, and their difference in sigmas: rms, largest."""
     pairs = [
         (getattr(clean.cameras[camera], name), getattr(track.cameras[camera], name))
         for camera in clean.cameras
@@ -279,7 +279,7 @@ def compared(clean: Trajectory, track: Trajectory, rows: NDArray[np.int64]) -> t
 
 
 def judged(name: str, scene: Scene, clean: Trajectory, learnt: Mapping[str, Learnt], folder: Path) -> dict[str, Any]:
-    """Spoil, track twice, and say what came out."""
+    """Plant a fault, track twice, and return the row of the table."""
     spoilt = FAULTS[name](scene)
     track, _, remarks = tracked(scene, spoilt, folder, learnt)
     anew, _, _ = tracked(scene, spoilt, folder, None)
@@ -311,7 +311,7 @@ def judged(name: str, scene: Scene, clean: Trajectory, learnt: Mapping[str, Lear
 
 
 def worst_deg(track: Trajectory, scene: Scene, there: NDArray[np.int64]) -> float:
-    """Largest error of a valid orientation."""
+    """Return the largest error of a valid orientation."""
     R = torch.from_numpy(scene.R_lab_body[there][track.valid])
     error = so3.geodesic_distance(torch.from_numpy(track.orientation[track.valid]), R)
     return float(torch.rad2deg(error).max())

@@ -1,10 +1,10 @@
-"""Heading and path of one rendered movie, in the lab's and in FicTrac's own axes, and what FicTrac's formulas give.
+"""Compare heading and path of a rendered movie in the lab's axes, in FicTrac's, and by FicTrac's formulas.
 
     scripts/fictrac_axes.py [--work FOLDER] [--frames 300]
 
-The ball is 9 degrees beside the camera's axis. `live` follows it without a map, its lines in the lab's axes and, with
-`--axes config.txt`, in FicTrac's. FicTrac itself does not run here: `fictrac_columns` is its Trackball.cpp (2.1.2)
-once more, for a ball whose turns are known; the truth of the movie goes through it.
+The ball is 9 degrees beside the camera's axis. `live` follows it without a map and writes lines in the lab's axes and,
+with `--axes config.txt`, in FicTrac's. FicTrac itself does not run: `fictrac_columns` repeats its Trackball.cpp (2.1.2)
+for known rotations, here those of the movie's truth.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SEED = 4
 
 @dataclass(frozen=True, kw_only=True)
 class FicTracSetUp:
-    """What FicTrac knows of camera and ball."""
+    """Camera and ball as in FicTrac's config.txt."""
 
     size: tuple[int, int]  # px
     vfov_deg: float
@@ -61,7 +61,7 @@ class FicTracSetUp:
 
 
 def fictrac_columns(R_cam_body: Floats, about: FicTracSetUp) -> Floats:
-    """Return columns 2 to 4, 6 to 21 of FicTrac's table, (N, 19), of a ball's orientations (N, 3, 3) in true camera
+    """Return columns 2 to 4, 6 to 21 of FicTrac's table, (N, 19), for orientations (N, 3, 3) of a ball in true camera
     axes. Source: Trackball::updatePath, doSearch; CmPoint::getRotationTo.
     """
     sphere_c = about.ball()
@@ -91,7 +91,7 @@ def fictrac_columns(R_cam_body: Floats, about: FicTracSetUp) -> Floats:
 
 
 def write_movie(folder: Path, frames: int) -> tuple[FicTracSetUp, Floats]:
-    """Render the movie and its config.txt; return what FicTrac knows, and R_cam_body (N, 3, 3)."""
+    """Render the movie and its config.txt; return FicTrac's set-up, and R_cam_body (N, 3, 3)."""
     from sphereorient.bench.ball import BallScene, Caps, write_ball_scene
     from sphereorient.experiment import load_experiment
 

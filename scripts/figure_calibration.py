@@ -4,7 +4,7 @@
 
 The plate is drawn by the package's own cameras, behind 12 mm of Plexiglas: every pixel's lines of sight are followed
 into the liquid and to the plate. With --folder the pictures and their calibration.yaml are kept there, to try the
-command on. Prints what the calibration found, and by how much it misses the exact cameras within 60 mm.
+command on. Prints the calibration, and its error within 60 mm against the exact cameras.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ PLATE = DotPlate(
     fiducials=((0, 0), (3, 0), (0, 2)),
 )
 PLACES = {"cam1": [[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], "cam2": [[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]}
-# The surveyed pose faces the middle between the cameras; the others are turned from it (degrees) and moved (mm).
+# The surveyed pose faces the middle between the cameras; the others are rotated from it (degrees) and moved (mm).
 TURNS_DEG = [[0, 0, 0], [20, 5, 0], [-18, 10, 90], [5, 25, 40], [0, -24, -60], [14, -12, 180], [-12, -15, 130]]
 MOVES_MM = [[0, 0, 0], [4, -3, 2], [-5, 4, 0], [0, 5, -4], [6, 0, 3], [-3, -5, -5], [2, 3, 6]]
 

@@ -1,9 +1,9 @@
-"""Draw docs/conventions.png: the frames, the map and how a camera sees it, and where pixels lie; and docs/animal.png.
+"""Draw docs/conventions.png: frames, map, its picture in a camera, and pixel coordinates; and docs/animal.png.
 
     scripts/figure_conventions.py [--out docs]
 
-The second one shows how an animal's walk follows from the turns of the ball under it. Maps,
-spheres and walks are those of the package's own functions, so that the pictures show what the code does.
+The second figure shows how an animal's walk follows from the ball's rotation. Maps, spheres and walks are computed by
+the package's own functions.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ R_LAB_BODY = so3.exp(torch.tensor([0.0, 0.0, -math.pi / 2]))  # body +x towards 
 
 
 def letter_map() -> Tensor:
-    """A map (H, 2 H), 0 .. 1: an F about its middle, which no mirrored picture shows, and lines every 30 degrees."""
+    """Return a map (H, 2 H), 0 .. 1: an F about its middle, which shows mirroring, and lines every 30 degrees."""
     grey = torch.full((HEIGHT, 2 * HEIGHT), 0.82)
     grey[:, ::30] = grey[::30, :] = 0.62
     grey[:, HEIGHT:] -= 0.12  # east of the middle a little darker
@@ -66,7 +66,7 @@ def main() -> None:
 
 
 def draw_frames(axes: Any) -> None:
-    """Lab, camera and body axes for the check of all signs."""
+    """Draw lab, camera and body axes, to check all signs."""
     camera, sphere = np.array([0.0, -4.6, 0.0]), np.zeros(3)
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 25))
     ball = 0.8 * np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)])
@@ -85,14 +85,14 @@ def draw_frames(axes: Any) -> None:
 
 
 def triad(axes: Any, origin: NDArray[Any], columns: NDArray[Any], name: str, length: float) -> None:
-    """Three arrows; `columns` are their directions in the lab."""
+    """Draw three arrows; `columns` are their directions in the lab."""
     for axis, direction, colour in zip("xyz", columns.T, AXIS_COLOURS, strict=True):
         axes.quiver(*origin, *(length * direction), color=colour, lw=2, arrow_length_ratio=0.18)
         axes.text(*(origin + 1.25 * length * direction), f"{name} {axis}", color=colour, fontsize=8, ha="center")
 
 
 def draw_map(axes: Any) -> None:
-    """The map, read as the world's maps are."""
+    """Draw the map, oriented as maps of the Earth are."""
     axes.imshow(letter_map(), cmap="gray", vmin=0, vmax=1, extent=(-180, 180, -90, 90))
     for longitude, down, text in ((0, 62, "body +x"), (90, 17, "body +y"), (-90, 17, "body -y")):
         axes.plot(longitude, 0, "o", color="#d35400", ms=5)
@@ -105,7 +105,7 @@ def draw_map(axes: Any) -> None:
 
 
 def draw_picture(axes: Any) -> None:
-    """What the camera of the first panel sees of that map."""
+    """Draw the picture of that map in the first panel's camera."""
     size = 240
     view = orthographic_view(size)
     picture = view.render(letter_map(), R_CAM_LAB @ R_LAB_BODY)
@@ -121,7 +121,7 @@ def draw_picture(axes: Any) -> None:
 
 
 def draw_pixels(axes: Any) -> None:
-    """A picture of 4 x 3 pixels: whole numbers are centres."""
+    """Draw a picture of 4 x 3 pixels: whole numbers are centres."""
     width, height = 4, 3
     for u in range(width):
         for v in range(height):
@@ -139,7 +139,7 @@ def draw_pixels(axes: Any) -> None:
 
 
 def draw_turns(axes: Any) -> None:
-    """The ball under the animal, and how each part of a walk turns it."""
+    """Draw the ball under the animal, and its rotation in each part of a walk."""
     upright = np.diag([1.0, -1.0, -1.0])  # the lab's z points down, that of the drawing up
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 25))
     ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)])
@@ -174,7 +174,7 @@ def draw_turns(axes: Any) -> None:
 
 
 def draw_walk(axes: Any) -> None:
-    """A walk: ahead, a turn to the right, ahead, a step to the right."""
+    """Draw a walk: ahead, a turn to the right, ahead, a step to the right."""
     ahead, right, about = np.array([0.0, 0.1, 0.0]), np.array([-0.1, 0.0, 0.0]), np.array([0.0, 0.0, -np.pi / 60])
     steps = [ahead] * 12 + [ahead + about] * 30 + [ahead] * 8 + [right] * 8
     R = [torch.eye(3, dtype=torch.float64)]

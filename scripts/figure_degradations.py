@@ -2,8 +2,8 @@
 
     scripts/figure_degradations.py [--out docs] [--check]
 
-With --check nothing is drawn or written; the exit code is 1 where the page is not what the table in
-sphereorient/synth/severities.py says.
+With --check nothing is drawn or written; the exit code is 1 if the page differs from the table in
+sphereorient/synth/severities.py.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ REPO = Path(__file__).resolve().parents[1]
 LEVELS = (0, 1, 3, 5)
 BASE = SynthSettings(frames=3, image_size=(200, 200), volume_mm=6.0, seed=11)
 FRAME = 1
-TRUE, TOLD, LOST = "#56B4E9", "#E69F00", "#000000"  # of Okabe and Ito
+TRUE, GIVEN, LOST = "#56B4E9", "#E69F00", "#000000"  # of Okabe and Ito
 AXIS_MM = 13.0  # length of the drawn body axes: they end outside of the ball
 MOVIE = 50  # frames of the movie whose dropped ones are shown
 BLOCKS, DPI = 2, 120
@@ -121,7 +121,7 @@ def grey(cell: Any, picture: NDArray[Any]) -> None:
 
 
 def lost(row: Degradation, level: int) -> NDArray[np.float64]:
-    """Which frames of both cameras are lost, in rows of ten, a gap between the cameras."""
+    """Draw which frames of both cameras are lost, in rows of ten, a gap between the cameras."""
     filming = Filming(BASE, {row.name: severity(row.name, level)} if level else {}, default_cameras(BASE))
     masks = [[k in filming.lost(name, MOVIE) for k in range(MOVIE)] for name in ("cam1", "cam2")]
     tiles = [np.kron(np.reshape(mask, (-1, 10)), np.pad(np.ones((8, 8)), 1)) for mask in masks]
@@ -139,16 +139,16 @@ def crop(path: Path, name: str, number: int, half: float) -> NDArray[np.uint8]:
 
 
 def compare(cell: Any, path: Path, name: str, half: float) -> None:
-    """Draw outline and body axes, as they are and as the method is told."""
+    """Draw outline and body axes, true and as the method has them."""
     with h5py.File(path.parent / "truth.h5") as file:
         position, R_lab_body = (torch.from_numpy(file[key][FRAME]) for key in ("position", "orientation"))
         corner = torch.from_numpy(np.rint(file[f"{name}/centre_px"][FRAME])) - round(half)
     experiment = load_experiment(path)
-    told = (experiment.cameras[name], float(experiment.diameter_mm or 0) / 2)
+    given = (experiment.cameras[name], float(experiment.diameter_mm or 0) / 2)
     true = (default_cameras(BASE)[name], BASE.diameter_mm / 2)
     # The true one wider and below, so that it is seen where both agree.
     outline(cell, true, (position, R_lab_body), corner, {"color": TRUE, "linewidth": 2.6})
-    outline(cell, told, (position, R_lab_body), corner, {"color": TOLD, "linewidth": 0.9})
+    outline(cell, given, (position, R_lab_body), corner, {"color": GIVEN, "linewidth": 0.9})
     cell.set(xlim=(-0.5, 2 * round(half) + 0.5), ylim=(2 * round(half) + 0.5, -0.5))
 
 
@@ -159,7 +159,7 @@ def outline(
     corner: torch.Tensor,
     look: dict[str, Any],
 ) -> None:
-    """Draw the circle and the three body axes that a camera shows of a ball of some radius, mm."""
+    """Draw the circle and the three body axes of a ball of some radius, mm, in a camera's picture."""
     (camera, radius_mm), (position, R_lab_body) = seen_by, pose
     disk = picture_of_ball(camera, position, radius_mm)
     angle = torch.linspace(0, 2 * torch.pi, 100, dtype=torch.float64)
@@ -179,7 +179,7 @@ def main() -> None:
     path = options.out / "degradations.md"
     if options.check:
         if not path.is_file() or path.read_text(encoding="utf-8") != page():
-            sys.exit(f"{path} is not what the table says: run scripts/figure_degradations.py")
+            sys.exit(f"{path} differs from the table: run scripts/figure_degradations.py")
         return
     path.write_text(page(), encoding="utf-8")
     figure().savefig(options.out / "degradations.png", dpi=DPI, metadata={"Software": None})

@@ -1,4 +1,4 @@
-"""Draw docs/paint-design.png and print its figures: what the size of patches does to the bound and to likeness.
+"""Draw docs/paint-design.png and print its figures: effect of the patch size on bound and likeness.
 
     scripts/figure_paint_design.py [--out docs/paint-design.png]
 
@@ -33,7 +33,7 @@ HEIGHT, SEED, SIDE_PX = 512, 1, 120
 
 @dataclass(frozen=True)
 class Row:
-    """One map, judged."""
+    """One map and its judgement."""
 
     kind: str
     size_deg: float

@@ -22,13 +22,13 @@ UNSEEN = {"cam1": slice(447, 453), "cam2": slice(417, 423)}  # a false stretch o
 
 def planted(seed: int) -> tuple[Tensor, dict[str, Candidates]]:
     """Return true orientations (N, 3, 3), rms omega of the paper, and 2 to 5 candidates a frame, wrong by 1 degree rms.
-    In a false stretch a candidate that turns as smoothly is always there, the true one in every third frame.
+    A false stretch always has a candidate that rotates as smoothly, and the true one in every third frame.
     """
     rng = torch.Generator().manual_seed(seed)
     R, other = (random_motion(0.3, 0.05, 7.8, 0.05, 40.0, 2 * seed + k).at(TIME_S).R_lab_body for k in (0, 1))
     aside, cameras = so3.exp(torch.tensor([0.0, 0.0, 1.9], dtype=torch.float64)), {}
     for name, stretches in STRETCHES.items():
-        every = so3.random_rotations((len(R), 5), generator=rng, dtype=torch.float64)  # true, false, and anywhere
+        every = so3.random_rotations((len(R), 5), generator=rng, dtype=torch.float64)  # true, false, and random
         there = torch.arange(5) < torch.randint(3, 6, (len(R), 1), generator=rng)
         every[:, 0], there[:, 1] = R, False
         for first, length in stretches.items():

@@ -3,7 +3,7 @@
     scripts/figure_report.py [EXPERIMENT] [--out out/walkthrough]
 
 Runs track, report and overlay as a user does, photographs the page with Chromium (through Playwright) and takes one
-frame of the overlay. EXPERIMENT is ../shared/experiment/experiment.yaml without it.
+frame of the overlay. Default: ../shared/experiment/experiment.yaml.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     scripts/figure_walkthrough.py
 
-A printed line takes the place of the line of a block that has the same words; tests/test_docs.py compares them.
+A printed line replaces the line of a block that has the same words; tests/test_docs.py compares them.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ def printed(text: str, folder: Path) -> list[str]:
     """Return the lines that the page's commands and Python print in a folder."""
     (folder / ".venv").symlink_to(sys.prefix)
     (folder / "out").mkdir()
-    said = ""
+    output = ""
     with contextlib.chdir(folder):
         for command in [line for block in blocks(text, "") for line in block.splitlines()]:
-            said += subprocess.run(command.split(), check=True, stdout=subprocess.PIPE, text=True).stdout
+            output += subprocess.run(command.split(), check=True, stdout=subprocess.PIPE, text=True).stdout
         names: dict[str, object] = {}
         with contextlib.redirect_stdout(io.StringIO()) as python:
             for block in blocks(text, "python"):
                 exec(block, names)
-    return (said + python.getvalue()).splitlines()
+    return (output + python.getvalue()).splitlines()
 
 
 def words(line: str) -> str:
-    """Return a line without its numbers, however it is spaced; those of names, as cam1, stay."""
+    """Return a line without its numbers and spacing; numbers in names, as cam1, stay."""
     return " ".join(re.sub(r"(?<![\w/])\d[\d.]*|[│┃|]", " ", line).split())
 
 

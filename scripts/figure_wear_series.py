@@ -1,10 +1,10 @@
-"""Make the figure of docs/map.md that shows a series of maps: wear that was planted, found as `compare-maps` finds it.
+"""Make the figure of docs/map.md of a series of maps: planted wear, found as by `compare-maps`.
 
     scripts/figure_wear_series.py [--out docs/map_series.png]
 
 Maps of four movies of one ball, each in its own body frame, at its own brightness, with noise, its paint displaced by
-0.3 degrees; one place wears off from the second movie on, another from the third. Prints what is found beside what was
-planted. Half a minute of one core.
+0.3 degrees; one region wears off from the second movie on, another from the third. Prints the found and the planted
+wear. Half a minute of one core.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ FRAMES = ((0.0, 0.0, 0.0), (0.3, -0.2, 0.5), (-1.0, 0.4, 2.0), (2.0, 1.0, -0.3))
 
 
 def main() -> None:
-    """Make maps, compare, tell."""
+    """Make maps, compare them, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=DOCS / "map_series.png")
     options = parser.parse_args()

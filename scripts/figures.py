@@ -1,4 +1,4 @@
-"""Make the tables and figures of the docs that hold numbers, and tell which are older than the code they measure.
+"""Make the tables and figures of the docs that hold numbers; list those older than the code they measure.
 
     scripts/figures.py                   # what is older or was never made, in order; a second call goes on
     scripts/figures.py --only NAME ...   # these, in any case
@@ -6,7 +6,7 @@
 
 A command writes its page itself, or prints Markdown whose tables go between the page's marks
 `<!-- figure NAME -->` and `<!-- end NAME -->`; what it prints is kept in out/figures. Numbers within sentences are
-copied by hand from there. docs/figures.md says of each figure when it was made, by what, and what it took.
+copied by hand from there. docs/figures.md holds date, commit and CPU time of each figure.
 """
 
 from __future__ import annotations
@@ -125,14 +125,14 @@ class Made:
 
 
 def code_of(figure: Figure) -> str:
-    """Return a word for the code that a figure measures."""
+    """Return a digest of the code that a figure measures."""
     program = figure.command.split()[0]
     cli = kept.rooms.modules()["cli.app"]
     return kept.digest(kept.code_of([cli if program == "sphereorient" else kept.SCRIPTS / program]))
 
 
 def rows() -> dict[str, Made]:
-    """Return what docs/figures.md says of each figure."""
+    """Return the row of each figure in docs/figures.md."""
     text = PAGE.read_text("utf-8") if PAGE.is_file() else ""
     found = re.findall(r"^\| (\S+) \| .* \| (\S*) \| (\S*) \| (\S*) \| (\w*)[^|]*\|$", text, re.MULTILINE)
     return {name: Made(*cells) for name, *cells in found}
@@ -146,7 +146,7 @@ def write_page(made: dict[str, Made]) -> None:
         "# Where the numbers of these pages come from",
         "",
         "Written by `scripts/figures.py`, which makes the tables and figures of these pages anew; `--only NAME` one of",
-        "them. `code` is a word for the code that made a figure; where that has changed, the figure is *older*.",
+        "them. `code` is a digest of the code that made a figure; if that has changed, the figure is *older*.",
         "",
         f"**{len(FIGURES)} figures, {len(older)} of them older than the code that they measure.**",
         "",

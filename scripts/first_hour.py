@@ -1,12 +1,12 @@
-"""The first hour of a new user as a protocol: the commands of a journey, their times, and what is said of wrong inputs.
+"""Print a new user's first hour as a protocol: commands, their times, and the messages about wrong inputs.
 
     scripts/first_hour.py tank|fictrac|wrong|notebook [--shared ../shared] [--work FOLDER]
 
 `tank`: two movies and plate pictures in a folder, nothing else. `fictrac`: the folder of FicTrac's sample movie. Both
-run the commands that `init` names.
-`wrong`: the first journey with a wrong input at each step. `notebook`: the toolkit's tutorial cell by cell, further
-calls of a user, and mistakes with their messages. What only the user knows is given by `--set`, once. Prints
-Markdown; errors against the truth where there is one, by the shared score_track.py.
+run the commands that `init` names. `wrong`: the first journey with a wrong input at each step. `notebook`: the
+toolkit's tutorial cell by cell, further calls of a user, and mistakes with their messages. Values that cannot be
+measured are given once, by `--set`. Prints Markdown; errors against the truth if there is one, by the shared
+score_track.py.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ import yaml
 
 REPO = Path(__file__).resolve().parents[1]
 PROGRAM = [sys.executable, "-m", "sphereorient.cli"]
-KNOWN = ["frame_rate=600", "sphere.diameter=18", "exposure=0.0004"]  # of the tank: what nobody can measure
+KNOWN = ["frame_rate=600", "sphere.diameter=18", "exposure=0.0004"]  # of the tank: what cannot be measured
 CASES = """
 camera_files_of_others: convert-cameras ros_camera_info.yaml --out ros.yaml
 camera_files_of_others: convert-cameras anipose.toml --out anipose.yaml
@@ -55,7 +55,7 @@ time_units: init ms.h5 --vfov 30 --set sphere.diameter=null
 variable_rate: movie vfr.mp4
 near_ball: check experiment.yaml
 sharp_pictures: check experiment.yaml
-"""  # of ../shared/cases: files of others that were read wrongly once
+"""  # of ../shared/cases: files of other programs that once were read wrongly
 SHOWN = 60  # letters of a word in the protocol
 CALLS = """
 import sphereorient; from sphereorient import Trajectory, load_texture
@@ -116,7 +116,7 @@ def main() -> None:
 
 
 def run(folder: Path, *words: str, wrong: bool = False) -> None:
-    """Run a command of the program and print its row, of a wrong one with its refusal or its doubts."""
+    """Run a command of the program and print its row; of a wrong one also the refusal or the warnings."""
     before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     done = subprocess.run([*PROGRAM, *words], cwd=folder, capture_output=True, text=True, stdin=subprocess.DEVNULL)
     after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - begun
@@ -133,7 +133,7 @@ def run(folder: Path, *words: str, wrong: bool = False) -> None:
 
 
 def head(what: str) -> None:
-    print(f"\n| {what} | wall s | CPU s | said |\n|---|---|---|---|")
+    print(f"\n| {what} | wall s | CPU s | message |\n|---|---|---|---|")
 
 
 def sets(values: Sequence[str]) -> list[str]:
@@ -141,7 +141,7 @@ def sets(values: Sequence[str]) -> list[str]:
 
 
 def tank_inputs(shared: Path, folder: Path) -> list[str]:
-    """Copy movies and plate pictures; return what the user knows of the plates, as `--set` takes it."""
+    """Copy movies and plate pictures; return the sizes of the plates for `--set`."""
     for movie in ("cam1.mkv", "cam2.mkv"):
         shutil.copy(shared / "tank" / movie, folder)
     shutil.copytree(shared / "tank" / "calibration", folder / "plates", ignore=shutil.ignore_patterns("*.yaml", "*.h5"))
@@ -180,7 +180,7 @@ def fictrac(shared: Path, folder: Path) -> None:
 
 
 def wrong(shared: Path, folder: Path) -> None:
-    """Make a mistake at each step of the first journey, then put it right."""
+    """Make a mistake at each step of the first journey, then correct it."""
     plates = tank_inputs(shared, folder)
     head("command, with a wrong input")
     run(folder, "init", "cam1.mkv", "cam3.mkv", *sets(KNOWN), wrong=True)
@@ -218,7 +218,7 @@ def wrong(shared: Path, folder: Path) -> None:
     run(folder, "track", "swapped.yaml", "--out", "track.h5", wrong=True)
     run(folder, "track", "experiment.yaml", "--out", "plates", wrong=True)
     run(folder, "report", "experiment.yaml", "--out", "report", wrong=True)
-    head("command, with a file of others")
+    head("command, with a file of another program")
     for case in CASES.strip().splitlines():
         name, words = case.split(": ")
         shutil.copytree(shared / "cases" / name, folder / name, dirs_exist_ok=True)
@@ -251,7 +251,7 @@ def notebook(shared: Path, folder: Path) -> None:
 
 
 def row(title: str, code: str, names: dict[str, Any], wrong: bool = False) -> None:
-    """Run code in a namespace and print its row, with what it printed or, of a mistake, the error."""
+    """Run code in a namespace and print its row, with its output or, of a mistake, the error."""
     printed, error = io.StringIO(), ""
     wall, cpu = time.perf_counter(), time.process_time()
     with contextlib.redirect_stdout(printed):
@@ -261,18 +261,18 @@ def row(title: str, code: str, names: dict[str, Any], wrong: bool = False) -> No
             if not wrong:
                 raise
             error = f"{type(problem).__name__}: {problem}"
-    said = " / ".join((error if wrong else printed.getvalue()).splitlines()) or ("no error" if wrong else "")
+    message = " / ".join((error if wrong else printed.getvalue()).splitlines()) or ("no error" if wrong else "")
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    print(f"| {title} | {wall:.1f} | {cpu:.1f} | {said.replace('|', ' ')} |", flush=True)
+    print(f"| {title} | {wall:.1f} | {cpu:.1f} | {message.replace('|', ' ')} |", flush=True)
 
 
 def score(shared: Path, track: Path, truth: Path, align: str) -> None:
-    """Print the errors: of orientations with one turn of the body frame removed, of positions as they are."""
+    """Print the errors: of orientations after one rotation of the body frame, of positions as they are."""
     command = [sys.executable, str(shared / "score_track.py"), str(track), str(truth)]
     found: dict[str, float] = {}
     for name, more in (("position", []), ("orientation", ["--align", align])):
-        told = subprocess.run([*command, *more], capture_output=True, text=True, check=True, env=os.environ).stdout
-        found |= {key: value for key, value in json.loads(told).items() if key.startswith(name)}
+        output = subprocess.run([*command, *more], capture_output=True, text=True, check=True, env=os.environ).stdout
+        found |= {key: value for key, value in json.loads(output).items() if key.startswith(name)}
     names = ("orientation_p50_deg", "orientation_p95_deg", "position_p50_mm", "position_p95_mm")
     print("\n" + "; ".join(f"{name} {found[name]:.4g}" for name in names if found.get(name) is not None))
 

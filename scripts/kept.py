@@ -1,7 +1,7 @@
-"""Work that is kept by what it depends on: the code that makes it, and its inputs.
+"""Keep results with a digest of the code that makes them and of their inputs.
 
-A comment or a docstring changes nothing; a changed line of a module that a piece of work imports, itself or through
-others, does.
+A changed line of a module that the work imports, directly or through others, changes the digest; a comment or a
+docstring does not.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ RECORD = "made_of.json"  # in a folder; beside a file: its name with this ending
 
 
 def code_of(scripts: Iterable[Path], without: Iterable[str] = ()) -> set[Path]:
-    """Return the files of code, C sources too, that scripts or modules depend on, but for those `without`."""
+    """Return the files of code, C sources too, that scripts or modules depend on, except those of `without`."""
     known, found, left_out, todo = _modules(), set[Path](), set(without), list(scripts)
     while todo:
         path = todo.pop()
@@ -33,7 +33,7 @@ def code_of(scripts: Iterable[Path], without: Iterable[str] = ()) -> set[Path]:
         found.add(path)
         for name in _imports(path):
             parts = name.split(".")
-            # What a module imports runs its packages' front doors as well.
+            # An import runs the __init__.py of its packages as well.
             whole = [".".join(parts[: k + 1]) for k in range(len(parts))]
             if not left_out.intersection(whole):
                 todo += [known[part] for part in whole if part in known]
@@ -57,7 +57,7 @@ def _imports(path: Path) -> set[str]:
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             names.add(str(node.module))
-            # The front door hands out names of all rooms.
+            # sphereorient/__init__.py exports names of all rooms.
             doors = node.module == "sphereorient" and any(alias.name not in _modules() for alias in node.names)
             names |= {"cli.app", "run"} if doors else set()
     return names | ({"cli.app", "run"} if "subprocess" in names else set())  # programs may do anything
@@ -70,7 +70,7 @@ def _compiled(found: set[Path]) -> set[Path]:
 
 @lru_cache(maxsize=1024)
 def _meaning(path: Path, changed_ns: int) -> bytes:
-    """Return what a file of code says, without comments and docstrings."""
+    """Return the content of a file of code without comments and docstrings."""
     if path.suffix != ".py":
         return path.read_bytes()
     tree = ast.parse(path.read_text())
@@ -82,20 +82,20 @@ def _meaning(path: Path, changed_ns: int) -> bytes:
 
 
 def digest(files: Iterable[Path], *inputs: Any) -> str:
-    """Return a word for what files of code say and for inputs that `repr` tells apart."""
-    told = hashlib.sha256(repr(inputs).encode())
+    """Return a digest of files of code and of inputs, compared by `repr`."""
+    hasher = hashlib.sha256(repr(inputs).encode())
     for path in sorted(files):
-        told.update(path.name.encode() + _meaning(path, path.stat().st_mtime_ns))
-    return told.hexdigest()[:16]
+        hasher.update(path.name.encode() + _meaning(path, path.stat().st_mtime_ns))
+    return hasher.hexdigest()[:16]
 
 
 def record_of(made: Path) -> Path:
-    """Return where it is kept what a file or a folder was made of."""
+    """Return the path of the record of a file or a folder."""
     return made / RECORD if made.is_dir() else made.with_name(f"{made.name}.{RECORD}")
 
 
 def known(made: Path) -> dict[str, Any]:
-    """Return what was noted of a file or a folder when it was made; empty: nothing."""
+    """Return the record of a file or a folder; empty: none."""
     try:
         found = json.loads(record_of(made).read_text("utf-8"))
     except (OSError, ValueError):
@@ -104,8 +104,8 @@ def known(made: Path) -> dict[str, Any]:
 
 
 def note(made: Path, **words: Any) -> None:
-    """Note what a file or a folder was made of."""
-    # By its command `write_text` knows the file as ours, and replaces it.
+    """Write the record of a file or a folder."""
+    # `write_text` replaces only files with a `command` of ours.
     write_text(record_of(made), json.dumps({"command": "sphereorient scripts", **words}) + "\n")
 
 

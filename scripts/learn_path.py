@@ -2,11 +2,11 @@
 
     scripts/learn_path.py [--frames 240] [--movies 24] [--steps 120] [--honest] [--out learnt.yaml]
 
-No pictures: true orientations with noise among false candidates, with likelihoods that overlap. The likelihoods claim
-three times the nats that they are worth and the orientations' sigmas are claimed 1.7 times too small, as fits to
-pictures do that leave out what neighbouring pixels share; with --honest both are worth what they claim. Learning:
-gradient through the soft path of the mean negative log probability of what is true, over whole movies. Prints Markdown;
---out writes the learnt settings to a file that `sphereorient track --settings` reads.
+No pictures: true orientations with noise among false candidates, with likelihoods that overlap. The likelihoods are
+three times too large (in nats) and the orientations' sigmas 1.7 times too small, as in fits that neglect the
+correlation of neighbouring pixels; with --honest both are right. Learning descends the gradient, through the soft path,
+of the mean negative log probability of the truth, over whole movies. Prints Markdown; --out writes the learnt settings
+to a file that `sphereorient track --settings` reads.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ DEFAULT = PathSettings(acceleration_rad_s2=math.radians(0.5) * RATE_HZ**2)  # ST
 
 @dataclass(frozen=True, kw_only=True)
 class Claims:
-    """What the pictures claim over what is so."""
+    """Ratios of the stated to the right nats and sigmas."""
 
     nats: float = 3.0
     sigma: float = 1 / 1.7
@@ -46,23 +46,23 @@ class Claims:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Labelled:
-    """Movies with the place of the true candidate."""
+    """Movies with the index of the true candidate."""
 
     frames: dict[str, Tensor]  # arguments of PathLayer
     place: Tensor  # (B, N) int64, of C candidates; C where none is right, also in empty frames
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Answer:
-    """What a path says of some movies."""
+class PathResult:
+    """Result of a path for some movies."""
 
     choice: Tensor  # (B, N), C: none
     confidence: Tensor  # (B, N), of the choice
-    nll: Tensor  # (B, N), of what is true, nats; NaN in empty frames
+    nll: Tensor  # (B, N), of the truth, nats; NaN in empty frames
 
 
 def true_orientations(seed: int, frames: int, rng: torch.Generator) -> Tensor:
-    """A smooth motion, slow to fast (0.5 to 6 degrees a frame), (N, 3, 3)."""
+    """Return a smooth motion, slow to fast (0.5 to 6 degrees a frame), (N, 3, 3)."""
     share = torch.rand(2, generator=rng).tolist()
     omega_rms, omega_s = 5.0 * 12.0 ** share[0], 0.02 * 5.0 ** share[1]
     motion = random_motion(0.3, 0.05, omega_rms, omega_s, 40.0, seed)
@@ -70,7 +70,7 @@ def true_orientations(seed: int, frames: int, rng: torch.Generator) -> Tensor:
 
 
 def standing(frames: int, rng: torch.Generator) -> Tensor:
-    """A false candidate that stays where it is for some tens of frames, (N, 3, 3)."""
+    """Return a false candidate that is constant for some tens of frames, (N, 3, 3)."""
     run = (torch.rand(frames, generator=rng) < 1 / 40).long().cumsum(0)
     return so3.random_rotations(int(run[-1]) + 1, generator=rng, dtype=torch.float64)[run]
 
@@ -80,7 +80,7 @@ def noisy(R: Tensor, sigma_rad: Tensor, rng: torch.Generator) -> Tensor:
 
 
 def draw(seed: int, frames: int, claims: Claims) -> Labelled:
-    """One movie, (1, N) frames."""
+    """Draw one movie, (1, N) frames."""
     rng = torch.Generator().manual_seed(seed)
     width = FALSE + 1
     every = so3.random_rotations((frames, width), generator=rng, dtype=torch.float64)
@@ -108,20 +108,20 @@ def draw(seed: int, frames: int, claims: Claims) -> Labelled:
 
 
 def movies(first_seed: int, count: int, frames: int, claims: Claims) -> Labelled:
-    """Some movies as one batch."""
+    """Draw some movies as one batch."""
     each = [draw(first_seed + k, frames, claims) for k in range(count)]
     parts = {name: torch.cat([x.frames[name] for x in each]) for name in each[0].frames}
     return Labelled(frames=parts, place=torch.cat([x.place for x in each]))
 
 
 def true_nll(marginals: Tensor, known: Labelled) -> Tensor:
-    """Negative log probability of what is true, (B, N), nats; NaN in empty frames."""
+    """Return the negative log probability of the truth, (B, N), nats; NaN in empty frames."""
     probability = marginals.gather(-1, known.place[..., None])[..., 0]
     return torch.where(known.frames["mask"].any(-1), -probability.clamp_min(1e-12).log(), torch.nan)
 
 
 def learn(known: Labelled, begin: PathSettings, steps: int) -> PathSettings:
-    """Adam on the parameters of the layer."""
+    """Learn the parameters of the layer by Adam."""
     model = PathLayer(2, soft=1.0, settings=begin)
     optimizer = torch.optim.Adam(model.parameters(), lr=0.1)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
@@ -136,37 +136,37 @@ def learn(known: Labelled, begin: PathSettings, steps: int) -> PathSettings:
     return learnt
 
 
-def answer(settings: PathSettings, known: Labelled) -> Answer:
-    """The path of `track`."""
+def path_result(settings: PathSettings, known: Labelled) -> PathResult:
+    """Return the result of the path that `track` uses."""
     path, width = PathLayer(2, settings=settings)(**known.frames), known.frames["mask"].shape[-1]
     choice = torch.where(path.choice < 0, width, path.choice)
     marginals = torch.cat([path.posterior, (1 - path.posterior.sum(-1, keepdim=True)).clamp_min(0)], -1)
     confidence = marginals.gather(-1, choice[..., None])[..., 0]
-    return Answer(choice=choice, confidence=confidence, nll=true_nll(marginals, known))
+    return PathResult(choice=choice, confidence=confidence, nll=true_nll(marginals, known))
 
 
-def wrong_share(said: Answer, known: Labelled) -> Tensor:
-    """Share of a movie's frames with candidates in which what is chosen is not what is true, (B,)."""
+def wrong_share(result: PathResult, known: Labelled) -> Tensor:
+    """Return each movie's share of frames with candidates whose choice is wrong, (B,)."""
     there = known.frames["mask"].any(-1)
-    return ((said.choice != known.place) & there).sum(-1) / there.sum(-1)
+    return ((result.choice != known.place) & there).sum(-1) / there.sum(-1)
 
 
-def row(name: str, said: Answer, known: Labelled) -> str:
+def row(name: str, result: PathResult, known: Labelled) -> str:
     there, width = known.frames["mask"].any(-1), known.frames["mask"].shape[-1]
     seen = there & (known.place < width)
-    wrong = wrong_share(said, known)
-    false = ((said.choice != known.place) & (said.choice < width) & there).sum() / there.sum()
-    lost = ((said.choice == width) & seen).sum() / seen.sum()
-    chosen = there & (said.choice < width)
-    curve = reliability(said.confidence[chosen].numpy(), (said.choice == known.place)[chosen].numpy())
+    wrong = wrong_share(result, known)
+    false = ((result.choice != known.place) & (result.choice < width) & there).sum() / there.sum()
+    lost = ((result.choice == width) & seen).sum() / seen.sum()
+    chosen = there & (result.choice < width)
+    curve = reliability(result.confidence[chosen].numpy(), (result.choice == known.place)[chosen].numpy())
     scatter = float(wrong.std()) / math.sqrt(len(wrong))
     return (
         f"| {name} | {100 * float(wrong.mean()):.2f} ± {100 * scatter:.2f} | {100 * float(false):.2f} |"
-        f" {100 * float(lost):.2f} | {float(said.nll.nanmean()):.4f} | {curve.error:.4f} ({curve.chance:.4f}) |"
+        f" {100 * float(lost):.2f} | {float(result.nll.nanmean()):.4f} | {curve.error:.4f} ({curve.chance:.4f}) |"
     )
 
 
-def compared(after: Answer, before: Answer, known: Labelled) -> str:
+def compared(after: PathResult, before: PathResult, known: Labelled) -> str:
     change = (wrong_share(before, known) - wrong_share(after, known)).numpy()
     nats = (before.nll - after.nll).nanmean(-1).numpy()
     parts = []
@@ -202,10 +202,10 @@ def main() -> None:
     print("|---|---|---|---|---|---|")
     quiet = PathSettings(acceleration_rad_s2=learnt.acceleration_rad_s2)
     named = {"default": PathSettings(), "default, acceleration learnt": quiet, "learnt": learnt}
-    said = {name: answer(settings, other) for name, settings in named.items()}
-    for name, each in said.items():
+    results = {name: path_result(settings, other) for name, settings in named.items()}
+    for name, each in results.items():
         print(row(name, each, other))
-    print(f"\nLearnt against default: {compared(said['learnt'], said['default'], other)}.")
+    print(f"\nLearnt against default: {compared(results['learnt'], results['default'], other)}.")
 
 
 if __name__ == "__main__":

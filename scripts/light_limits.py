@@ -1,10 +1,9 @@
-"""What light and blur cost that spoilt pictures teach: why `precise` is wrong where much is hidden or misdrawn.
+"""Measure the error from light and blur learnt from spoilt pictures, where much is hidden or the map is wrong.
 
     scripts/light_limits.py [--work FOLDER] [--scenes occlusion:3 occlusion:4 texture_error:3 texture_error:4]
 
-Scenes of the robustness benchmark, each fitted from the true poses on: with the light and blur that its own pictures
-teach, and with those of the clean movie, everything else alike. Prints median errors of the orientation, degrees, of
-all cameras together.
+Scenes of the robustness benchmark, fitted from the true poses: with the light and blur learnt from their own pictures,
+and with those of the clean movie. Prints median errors of the orientation, degrees, of all cameras together.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from sphereorient.pose.camera_view import widest_px
 from sphereorient.pose.poses import PoseStart
 
 SCENES = ["occlusion:2", "occlusion:3", "occlusion:4", "occlusion:5", *(f"texture_error:{k}" for k in (3, 4, 5))]
-STEPS = 20  # of the fits: they have arrived
+STEPS = 20  # of the fits: enough to converge
 
 
 def main() -> None:
@@ -55,10 +54,10 @@ def main() -> None:
                 right = f"{error_deg(known, recording, path):.3f}"
                 try:
                     own = appearance_of(recording)
-                    told = f"{error_deg(own.fitter, recording, path):.3f}", f"{own.fitter.optics.blur_px:.2f}"
+                    cells = f"{error_deg(own.fitter, recording, path):.3f}", f"{own.fitter.optics.blur_px:.2f}"
                 except ExperimentError:
-                    told = "refused", ""
-            print(f"| {name} {level} | {told[0]} | {right} | {told[1]} |", flush=True)
+                    cells = "refused", ""
+            print(f"| {name} {level} | {cells[0]} | {right} | {cells[1]} |", flush=True)
 
 
 def scene(work: Path, kind: str, level: int) -> Path:
@@ -72,7 +71,7 @@ def scene(work: Path, kind: str, level: int) -> Path:
 
 
 def appearance_of(recording: Recording) -> Appearance:
-    """Return what the precise method learns of a movie."""
+    """Return the appearance that the precise method learns from a movie."""
     job = Job(recording=recording, settings=Settings(), device=torch.device("cpu"))
     return learn(job, silent).appearance
 
@@ -84,12 +83,12 @@ def with_map_of(fitter: Fitter, recording: Recording) -> Fitter:
 
 
 def error_deg(fitter: Fitter, recording: Recording, path: Path) -> float:
-    """Return the median error of the orientation of all frames, fitted from the truth on."""
+    """Return the median error of the orientation of all frames, fitted from the truth."""
     with h5py.File(path.parent / "truth.h5") as truth:
         X, R = (torch.from_numpy(truth[name][()]) for name in ("position", "orientation"))
-    shots, _ = sample_frames(recording, fitter.views, len(X))
+    samples, _ = sample_frames(recording, fitter.views, len(X))
     use: Tensor = torch.ones(len(X), len(fitter.views), dtype=torch.bool)
-    pixels = fitter.pixels([[shot.picture for shot in frame] for frame in shots], X, fitter.optics.fine)
+    pixels = fitter.pixels([[frame.picture for frame in instant] for instant in samples], X, fitter.optics.fine)
     fit = fitter.fit(pixels, PoseStart(X, R, use), fitter.optics.fine, STEPS)
     return float(torch.rad2deg(so3.geodesic_distance(fit.R_lab_body, R)).median())
 

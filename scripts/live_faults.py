@@ -1,10 +1,10 @@
-"""Faults while `live` tracks: a black-out, a hand before the ball, a turn of 60 degrees between frames, a lamp.
+"""Plant faults while `live` tracks: a black-out, a hand before the ball, a jump of 60 degrees, a lamp.
 
     scripts/live_faults.py EXPERIMENT [--learnt learnt.h5] [--cameras cam1]
 
-The frames of the experiment, changed, one by one; truth.h5 beside it tells errors. Prints Markdown: of each fault how
-many frames are without a pose or flagged, how many are wrong without a flag, and the time from the arrival of the first
-good frame to its pose.
+The changed frames of the experiment arrive one by one; errors are against truth.h5 beside it. Prints Markdown, for each
+fault: frames without a pose or flagged, wrong frames without a flag, and the time from the arrival of the first good
+frame to its pose.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from sphereorient.methods.settings import Settings
 
 FIRST, LONG_S, JUMP_DEG = 60, 0.5, 60.0
 HAND_GREY, HAND_SHARE, LAMP = 128, 0.7, 0.6
-WRONG_DEG = 1.0  # from truth, one turn of the body frame removed
+WRONG_DEG = 1.0  # from truth, one rotation of the body frame removed
 
 
 def main() -> None:
@@ -50,11 +50,11 @@ def main() -> None:
             disks = [(*view.camera.project(X).tolist(), view.diameter_px / 2) for view in views]
             rows, shown, fault = changed(name, frames, R_true, disks)
             found = list(measured(opened.tracker, views, arriving(shown)))
-        print(f"| {name} | {told(found, rows, fault, R_true)} |", flush=True)
+        print(f"| {name} | {cells_of(found, rows, fault, R_true)} |", flush=True)
 
 
 def arriving(frames: Sequence[Arrival]) -> Iterator[Arrival]:
-    """Each frame arrives when it is asked for."""
+    """Yield frames; each arrives when it is read."""
     for frame in frames:
         yield replace(frame, arrived_s=time.perf_counter())
 
@@ -62,7 +62,7 @@ def arriving(frames: Sequence[Arrival]) -> Iterator[Arrival]:
 def changed(
     name: str, frames: list[Arrival], R: torch.Tensor, disks: Sequence[tuple[float, float, float]]
 ) -> tuple[list[int], list[Arrival], range]:
-    """Rows of the movie that are shown, as frames of even times, and which of these show the fault."""
+    """Return the rows of the movie that are shown, these as evenly spaced frames, and the range with the fault."""
     step_s = frames[1].time_s - frames[0].time_s
     rows, fault = list(range(len(frames))), range(FIRST, FIRST + round(LONG_S / step_s))
     if name == "turn":
@@ -86,8 +86,8 @@ def changed(
     return rows, shown, fault
 
 
-def told(found: list[Measured], rows: list[int], fault: range, R_true: torch.Tensor) -> str:
-    """Cells of a fault's row."""
+def cells_of(found: list[Measured], rows: list[int], fault: range, R_true: torch.Tensor) -> str:
+    """Return the cells of a fault's row."""
     valid = np.array([now.valid for now in found])
     flagged = ~valid | np.array([now.found for now in found])
     R, true = torch.from_numpy(np.stack([now.R_lab_body for now in found])).nan_to_num(), R_true[rows]

@@ -3,7 +3,7 @@
     scripts/make_excerpt.py EXPERIMENT_FOLDER OUT_FOLDER [--first 22] [--frames 40]
 
 The frames' grey values are kept exactly. Times begin at 0 again. The pictures of the empty scene are the clipped mean
-of the whole movie: in 40 frames the sphere moves too little to tell it from what lies behind.
+of the whole movie: in 40 frames the sphere moves too little to separate it from the background.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ def write_card(source: Path, out: Path, first: int, last: int) -> None:
     files = sorted(path for path in out.iterdir() if path.name != "card.json")
     card = {
         "what": f"frames {first} .. {last - 1} of two cameras filming a painted sphere in a mixer, with exact truth",
-        "origin": "path traced with Mitsuba 3 from geometry written for this project's tests; nothing of sphereorient "
-        "took part in the pictures; no third-party content",
+        "origin": "path traced with Mitsuba 3 from geometry written for this project's tests; made without "
+        "sphereorient; no third-party content",
         "licence": "MIT, as the project",
         "made_by": "scripts/make_excerpt.py",
         "source_sha256": {

@@ -2,7 +2,7 @@
 
     scripts/make_parameters.py [--check]
 
-With --check nothing is written; the exit code is 1 where a file is not what the settings say.
+With --check nothing is written; the exit code is 1 if a file differs from the settings.
 """
 
 from __future__ import annotations

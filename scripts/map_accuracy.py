@@ -1,12 +1,12 @@
-"""How good are maps learnt from movies alone: the table of docs/map.md, time and peak memory of each beside it.
+"""Measure maps learnt from movies alone: the table of docs/map.md, with time and peak memory.
 
     scripts/map_accuracy.py [--shared ../shared] [--work FOLDER] [--only synth_dots experiment] [--set paint.rounds=8]
 
-Two synthetic movies of other paints, which this script renders; and the shared experiment, its camera cam1 alone, and
-the ball fixed in its place, where they are there. Each movie goes through `sphereorient map`, and with the map learnt
-through `sphereorient track`: processes of their own, one thread. The map is compared with the exact one by our own
-`compare_maps` and, where it is there, by the shared score_map.py. Prints one Markdown table; after the row of the fixed
-ball a second one, with FicTrac's result on the same movie beside ours.
+Movies: two synthetic ones of other paints, rendered here; and, where they are there, the shared experiment, its camera
+cam1 alone, and the fixed ball. `sphereorient map` learns each map and `sphereorient track` tracks with it, in processes
+of their own, one thread. The map is compared with the exact one by our `compare_maps` and by the shared score_map.py,
+if it is there. Prints one Markdown table; after the row of the fixed ball a second one, with FicTrac's result on the
+same movie beside ours.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class Usage:
-    """What a process took."""
+    """Time and memory of a process."""
 
     wall_s: float
     cpu_s: float
@@ -85,9 +85,9 @@ class Usage:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Attitudes:
-    """What one program measured beside the truth."""
+    """Measured orientations of one program and the truth."""
 
-    R: Tensor  # (N, 3, 3), the arbitrary rotations taken off; NaN where there is none
+    R: Tensor  # (N, 3, 3), the arbitrary rotations removed; NaN: none
     R_true: Tensor  # (N, 3, 3)
 
     def __len__(self) -> int:
@@ -101,13 +101,13 @@ class Attitudes:
 
     @property
     def step_deg(self) -> float:
-        """Median angle between the turns from frame to frame and the true ones."""
+        """Median error of the rotation from frame to frame."""
         return float(angles_deg(self.R[1:] @ self.R[:-1].mT, self.R_true[1:] @ self.R_true[:-1].mT).nanmedian())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Row:
-    """One movie: what came out of it, and what that took; made by `measured`."""
+    """Results of one movie and their cost; made by `measured`."""
 
     case: Case
     texture: Path
@@ -138,7 +138,7 @@ def main() -> None:
                 print(f"| {name} | not here: skipped |" + " |" * (len(COLUMNS) - 2), flush=True)
                 continue
             row = measured(case, work, options.overrides)
-            print(told(row, options.shared / "score_map.py"), flush=True)
+            print(row_text(row, options.shared / "score_map.py"), flush=True)
             if case.both:
                 print("\n" + beside_fictrac(row) + "\n", flush=True)
 
@@ -175,8 +175,8 @@ def measured(case: Case, work: Path, overrides: list[str]) -> Row:
     return Row(case=case, texture=texture, learnt=learnt, learning=learning, tracked=tracked, tracking=tracking)
 
 
-def told(row: Row, yardstick: Path) -> str:
-    """Word what came out for one movie."""
+def row_text(row: Row, yardstick: Path) -> str:
+    """Return the row of one movie."""
     case, frames = row.case, len(row.learnt)
     seen = read_seen(seen_path(row.texture))
     cells = [
@@ -194,7 +194,7 @@ def told(row: Row, yardstick: Path) -> str:
 
 
 def beside_fictrac(row: Row) -> str:
-    """Word the table of one movie that FicTrac tracked as well."""
+    """Return the table of one movie that FicTrac tracked as well."""
     frames, R_true = len(row.learnt), row.learnt.R_true
     programs = [
         ("`sphereorient map`", row.learnt, row.learning.words(frames)),
@@ -217,7 +217,7 @@ def fictrac_attitudes(path: Path) -> Tensor:
 
 
 def withheld(source: Path, texture: Path | None, path: Path) -> Path:
-    """Write an experiment again with another map or none, and return where."""
+    """Write an experiment with another map or none; return its path."""
     return write_experiment(replace(load_experiment(source).with_sphere(texture_path=texture), path=path))
 
 
@@ -227,7 +227,7 @@ def run(command: str, experiment: Path, out: Path, cameras: str | None, more: li
     words += [] if cameras is None else ["--cameras", cameras]
     begun = time.perf_counter()
     process = subprocess.Popen(words, env={**os.environ, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"})
-    # wait4 tells the peak of this one child.
+    # wait4 returns the peak of this child.
     _, status, usage = os.wait4(process.pid, 0)
     if status:
         raise SystemExit(f"{' '.join(words)}: failed")
@@ -264,14 +264,14 @@ def angles_deg(R: Tensor, S: Tensor) -> Tensor:
 
 
 def percentiles(angle_deg: Tensor) -> str:
-    """Word median and 95th percentile, and how many frames have none."""
+    """Return median, 95th percentile, and the number of frames without a value, as text."""
     known = angle_deg[torch.isfinite(angle_deg)]
     words = f"{float(known.quantile(0.5)):.3f} / {float(known.quantile(0.95)):.3f}"
     return words if len(known) == len(angle_deg) else f"{words} ({len(angle_deg) - len(known)} frames without)"
 
 
 def displaced(texture: Path, true: Path | None, yardstick: Path) -> list[str]:
-    """Word how far paint lies from where it is: by our own measure, and by the shared one."""
+    """Return the displacement of the paint as text: by our measure, and by the shared one."""
     if true is None:
         return ["no true map", ""]
     seen = read_seen(seen_path(texture))
@@ -287,8 +287,8 @@ def displaced(texture: Path, true: Path | None, yardstick: Path) -> list[str]:
     if not yardstick.is_file():
         return [own, ""]
     words = [sys.executable, str(yardstick), str(texture), str(true), "--seen", str(seen_path(texture))]
-    told = json.loads(subprocess.run(words, check=True, capture_output=True, text=True).stdout)
-    rms, p50, used = told["distortion_rms_deg"], told["distortion_p50_deg"], told["patches_used"]
+    scores = json.loads(subprocess.run(words, check=True, capture_output=True, text=True).stdout)
+    rms, p50, used = scores["distortion_rms_deg"], scores["distortion_p50_deg"], scores["patches_used"]
     return [own, f"{rms:.3f} / {p50:.3f}, {used}"]
 
 

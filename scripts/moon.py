@@ -3,12 +3,12 @@
     scripts/moon.py PICTURE ... --time 2020-03-09T23:32:46Z --place -11.0092,-37.0914 --map moon.png [--mirrored]
     scripts/moon.py FOLDER                    # of experiments NAME*/experiment.yaml and truth.csv; as docs/moon.md
 
-The orientation of the Moon is published to a millidegree, so a photograph tests a track against a truth that nobody
-made by a program. `--time` (UTC) and `--place` (latitude, longitude, degrees north and east) are those of the pictures,
+The orientation of the Moon is published to a millidegree, so a photograph tests a track against a truth that no
+program rendered. `--time` (UTC) and `--place` (latitude, longitude, degrees north and east) are those of the pictures,
 to a minute and a few km: they give the point of the Moon from which the camera is in the zenith. The roll about the
 line of sight is free, as the camera was not levelled. `--map`: an equirectangular map of the whole Moon, longitude 0 in
-its middle, east to the right, mean-Earth frame (docs/moon.md says where to get one). `--vfov` is not needed: the size
-of the Moon is known as well. Wants astronomy-engine: pip install 'sphereorient[moon]'. Prints a table in Markdown.
+its middle, east to the right, mean-Earth frame (source: docs/moon.md). `--vfov` is not needed: the size
+of the Moon is known as well. Needs astronomy-engine: pip install 'sphereorient[moon]'. Prints a table in Markdown.
 """
 
 from __future__ import annotations
@@ -116,8 +116,8 @@ def row(name: str, experiment: Path, at: Ephemeris, folder: Path, settings: list
     changes = [word for text in settings for word in ("--set", text)]
     try:
         program("track", experiment, "--out", track, "-q", "--force", *changes)
-    except SystemExit as told:
-        why = str(told).partition(";")[0].removeprefix("sphereorient: ")
+    except SystemExit as error:
+        why = str(error).partition(";")[0].removeprefix("sphereorient: ")
         return f"| {name} | {at.phase:.0f} | | | | | refused: {why} |"
     found = Trajectory.load(track)
     R, C = found.orientation[0], found.orientation_cov[0]
@@ -155,7 +155,7 @@ def main() -> None:
                     print(row(one["picture"], path, at, folder, given.set), flush=True)
             return
         if not (given.time and given.place and given.map):
-            parser.error("pictures want --time, --place and --map")
+            parser.error("pictures need --time, --place and --map")
         at = ephemeris(given.time, *map(float, given.place.split(",")))
         for picture in given.pictures:
             path = experiment_of(picture, given.map, at, folder, given.mirrored)

@@ -1,4 +1,4 @@
-"""Change one formula of the core at a time, and see whether a test fails.
+"""Change one formula of the core at a time, and check that a test fails.
 
     scripts/mutants.py [--only TEXT] [--jobs 2] [--list]
 
@@ -135,17 +135,17 @@ def main() -> int:
         if key not in results:
             results[key] = one.run()
             RESULTS.write_text(json.dumps(known, indent=1))
-        said[one] = results[key]
-        print(f"{one.room:10} {one.name:50} {said[one]} ({time.perf_counter() - begin:.0f} s)", flush=True)
+        outcome[one] = results[key]
+        print(f"{one.room:10} {one.name:50} {outcome[one]} ({time.perf_counter() - begin:.0f} s)", flush=True)
 
-    said: dict[Mutant, str] = {}
+    outcome: dict[Mutant, str] = {}
     with ThreadPoolExecutor(arguments.jobs) as pool:
         list(pool.map(run, chosen))
-    wrong = [one for one in chosen if not said[one].startswith("survived" if one.old == one.new else "killed")]
+    wrong = [one for one in chosen if not outcome[one].startswith("survived" if one.old == one.new else "killed")]
     changed = [one for one in chosen if one.old != one.new]
-    print(f"{sum(said[one].startswith('killed') for one in changed)} of {len(changed)} mutants killed")
+    print(f"{sum(outcome[one].startswith('killed') for one in changed)} of {len(changed)} mutants killed")
     for one in wrong:
-        print(f"{one.room}: {one.name}: {said[one]}")
+        print(f"{one.room}: {one.name}: {outcome[one]}")
     return int(bool(wrong))
 
 

@@ -36,7 +36,7 @@ from sphereorient.trajectory import Trajectory
 from sphereorient.trajectory.rotations import distance_deg
 
 STAGES = ("locate_sphere", "propose_orientations")
-# How many stages stay as they are, settings, and a context in which the code is another.
+# Number of unchanged stages, settings, and a context that replaces code.
 Change = tuple[int, tuple[str, ...], Callable[[], Any] | None]
 
 
@@ -99,7 +99,7 @@ def limits_off() -> Any:
 
 
 def changes() -> dict[str, Change]:
-    """The departures undone, by name."""
+    """Return the change that undoes each departure, by name."""
     return {
         "as it is": setting(0),
         "background: plain mean, the ball in it": (0, (), lambda: patch.object(scene, "learn_background", plain_mean)),
@@ -134,7 +134,7 @@ def changes() -> dict[str, Change]:
 
 
 def tracked(folder: Path, name: str, kept: dict[tuple[str, str], Any]) -> Trajectory:
-    """Track with one change; stages before it are taken from `kept`, where the run "as it is" left them."""
+    """Track with one change; stages before it are taken from `kept`, which the run "as it is" fills."""
     stay, overrides, change = changes()[name]
 
     def stage(label: str, of: Callable[..., Any], *arguments: Any) -> Any:
@@ -183,7 +183,7 @@ def row(track: Trajectory, truth: Path, name: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--only", nargs="*", help="names of departures; without it all")
+    parser.add_argument("--only", nargs="*", help="names of departures; default: all")
     parser.add_argument("--list", action="store_true", help="print the names")
     options = parser.parse_args()
     names = list(changes())

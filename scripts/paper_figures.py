@@ -77,7 +77,7 @@ class Example:
 
 
 def example_of(found: Measured) -> Example:
-    """Choose the track with the most valid frames, and of it a frame with several candidates for the whole ball."""
+    """Choose the track with the most valid frames, and in it a frame with several candidates for the whole ball."""
     number = int(np.argmax([track.valid.sum() for track in found.tracks]))
     track, experiment = found.tracks[number], found.experiments[number]
     seen, camera = track.cameras[CAMERA], experiment.cameras[CAMERA]
@@ -107,7 +107,7 @@ def example_of(found: Measured) -> Example:
 
 
 def blank(axes: Axes, words: str = "", below: str = "") -> None:
-    """Remove ticks and frame of a panel with a picture, and word it."""
+    """Remove ticks and frame of a panel with a picture, and label it."""
     axes.grid(False)
     axes.set(xticks=[], yticks=[])
     axes.set_title(words, fontsize=7.5)
@@ -407,7 +407,7 @@ def sample_track(example: Example) -> Figure:
     pair = [torch.from_numpy(track.cameras[name].orientation) for name in names[:2]]
     apart = np.rad2deg(so3.geodesic_distance(*pair).numpy())
     panels[2].plot(time_ms, apart, ".", color="black", markersize=2.5)
-    panels[0].set(ylabel="position, lab (mm)", ylim=(-110, 110))  # the tank; one camera alone may say more
+    panels[0].set(ylabel="position, lab (mm)", ylim=(-110, 110))  # the tank; positions by one camera may be outside
     panels[1].set(ylabel="angles (degrees)", ylim=(-185, 185), yticks=range(-180, 181, 90))
     panels[2].set(yscale="log", ylabel="distance of the\ncameras (degrees)", xlabel="time (ms)")
     look.plain_logarithms(panels[2].yaxis)

@@ -89,9 +89,9 @@ def impellers(size: tuple[int, int], camera: int, time_s: float) -> NDArray[np.f
 
 
 def put(light: NDArray[np.float32], exposure: Exposure, disk: Disk, seeds: tuple[int, int, int]) -> None:
-    """Put the sphere before grey levels (H, W), with what real pictures have: lamps of the tank, and bubbles.
+    """Draw the sphere over grey levels (H, W), with reflections of the tank's lamps, and bubbles.
 
-    `seeds` are camera, movie and frame: lamps stay, bubbles are of each frame.
+    `seeds` are camera, movie and frame: lamps are constant, bubbles change with the frame.
     """
     static, moving = (seeded(TEXTURE_SEED, *seeds[:count]) for count in (1, 3))
     bubbles = {"bubbles": float(torch.randint(MOST_BUBBLES + 1, (), generator=moving))}
@@ -114,7 +114,7 @@ def film(folder: Path, number: int, frames: int) -> None:
     def pictures(index: int, camera: Camera) -> Iterator[NDArray[np.uint8]]:
         rng = seeded(number, index)
         at, width = camera.project(X.mean(1)), torch.tensor(camera.image_size)
-        near = ((at > -width) & (at < 2 * width)).all(1)  # the lens's distortion is defined nearby only
+        near = ((at > -width) & (at < 2 * width)).all(1)  # the lens's distortion is valid only nearby
         disks = picture_of_ball(camera, X[near].mean(1), settings.diameter_mm / 2)
         seen, place = exposures([scene], camera, X[None, near], R[None, near]), near.cumsum(0) - 1
         for k in range(frames):

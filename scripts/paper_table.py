@@ -1,4 +1,4 @@
-"""The numbers of the paper beside ours: what each method measured in the movies, with error bars, and the truth."""
+"""The numbers of the paper beside ours: results of each method in the movies, with error bars, and the truth."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ def each(found: Mapping[str, Measured], of: Callable[[Measured], Interval]) -> d
 
 
 def accuracy_rows(found: Mapping[str, Measured], views: Mapping[str, Floats]) -> list[Row]:
-    """Errors of orientations and positions."""
+    """Return the errors of orientations and positions."""
 
     def of_cameras(one: Measured) -> list[Floats]:
         return [np.concatenate(list(score.camera_orientation_deg.values())) for score in one.scores]
@@ -260,7 +260,7 @@ def accuracy_rows(found: Mapping[str, Measured], views: Mapping[str, Floats]) ->
 
 
 def path_rows(found: Mapping[str, Measured]) -> list[Row]:
-    """How often there are candidates, and how often a path is repaired."""
+    """Return how often there are candidates, and how often a path is repaired."""
 
     def counts(one: Measured) -> list[Floats]:
         parts = []
@@ -312,7 +312,7 @@ SYMBOLS = {
 
 
 def motion_rows(found: Mapping[str, Measured], settings: StatisticsSettings) -> list[Row]:
-    """Table I as measured, and the rms values of accelerations without the noise that the tracks state."""
+    """Return Table I as measured, and the rms of accelerations without the stated noise of the tracks."""
     tables: dict[str, Mapping[str, Moments]] = {method: one.summary.table for method, one in found.items()}
     tables["truth"] = table_of_moments(found["paper"].true_ensemble, settings)
     rows = []
@@ -342,7 +342,7 @@ PRINTED_SHAPE = {  # a and flatness, printed; flatness corrected
 
 
 def shape_rows(found: Mapping[str, Measured], settings: StatisticsSettings) -> list[Row]:
-    """Flatness and the width a of the stretched exponential."""
+    """Return flatness and the width a of the stretched exponential."""
     ensembles = {method: one.summary.ensemble for method, one in found.items()}
     ensembles["truth"] = found["paper"].true_ensemble
     rows = []
@@ -365,7 +365,7 @@ def stays(truth: Mapping[str, Floats], experiment: Experiment) -> Floats:
 
 
 def track_rows(found: Mapping[str, Measured]) -> list[Row]:
-    """Durations, uniformity, and scales of the flow."""
+    """Return durations, uniformity, and scales of the flow."""
     flow = FlowScales(viscosity_m2_s=VISCOSITY_M2_S, dissipation_w_kg=DISSIPATION_W_KG)
     more = {method: one.summary.distributions for method, one in found.items()}
     known = {method: one for method, one in more.items() if one is not None}

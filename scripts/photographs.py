@@ -1,13 +1,12 @@
-"""How many photographs a map wants: sets of pictures at random attitudes, learnt from by `sphereorient map`.
+"""Measure how many photographs a map needs: `sphereorient map` learns from sets at random attitudes.
 
     scripts/photographs.py [--counts 8 12 20 30] [--sets 6] [--moves] [--diameter 200] [--pairs-only]
 
-Each set is rendered anew: a ball of random paint, of which every picture shows an attitude drawn uniformly from all
-rotations, seen by one camera, in one place or, with `--moves`, anywhere in the picture and without a picture of the
-empty scene. `sphereorient map --photographs` learns the map in a process of its own, one thread; with `--pairs-only`
-attitudes are found from pairs of pictures alone, as it begins, which tells sooner what can be solved. Attitudes are
-compared after one rotation of the body frame, maps by `compare_maps`. Prints one row a set, and one in bold a number
-of pictures.
+Each set shows a ball of random paint at uniformly random attitudes, seen by one camera, at one position or, with
+`--moves`, anywhere in the picture and without a picture of the empty scene. `sphereorient map --photographs` learns the
+map in a process of its own, one thread; with `--pairs-only` attitudes are found from pairs of pictures alone, the first
+step of `map`, which is quicker. Attitudes are compared after one rotation of the body frame, maps by `compare_maps`.
+Prints one row per set, and one in bold per number of pictures.
 """
 
 from __future__ import annotations
@@ -46,9 +45,9 @@ from sphereorient.synth.scene import make_scene, render_frame, seeded
 from sphereorient.synth.write import default_cameras
 from sphereorient.trajectory import Trajectory
 
-SIDE, WIDE_SIDE = 1.4, 2.6  # of the picture, in diameters of the ball, in one place and moving
+SIDE, WIDE_SIDE = 1.4, 2.6  # of the picture, in diameters of the ball, fixed and moving
 DISTANCE_MM = 400.0
-WRONG_DEG = 8.0  # beyond it a picture is in a wrong place
+WRONG_DEG = 8.0  # a larger error is a wrong attitude
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +96,7 @@ def write_stills(folder: Path, stills: Stills) -> Path:
 
 @dataclass(frozen=True, kw_only=True)
 class Solved:
-    """What became of a set."""
+    """Result of a set."""
 
     used: int
     error_deg: Tensor  # of the pictures that have an attitude
@@ -106,12 +105,12 @@ class Solved:
 
 
 def main() -> None:
-    """Print a row a set, and one a number of pictures."""
+    """Print a row per set, and one per number of pictures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--counts", type=int, nargs="+", default=[8, 10, 12, 16, 20, 30, 40])
-    parser.add_argument("--sets", type=int, default=6, help="of each number of pictures, paints by turns")
+    parser.add_argument("--sets", type=int, default=6, help="number for each number of pictures, paints alternate")
     parser.add_argument("--diameter", type=float, default=200.0, help="of the ball, px")
-    parser.add_argument("--moves", action="store_true", help="the ball is elsewhere in every picture")
+    parser.add_argument("--moves", action="store_true", help="the position of the ball differs between pictures")
     parser.add_argument("--pairs-only", action="store_true", help="attitudes from pairs of pictures alone: no map")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -130,12 +129,12 @@ def main() -> None:
 
 
 def whole(every: list[Solved], count: int) -> int:
-    """Return how many sets are solved to the last picture."""
+    """Return the number of sets whose pictures are all right."""
     return sum(one.used == count and bool((one.error_deg < WRONG_DEG).all()) for one in every)
 
 
 def row(name: str, every: list[Solved], count: int) -> str:
-    """Word one set, or several together."""
+    """Return the row of one set, or of several together."""
     used = sum(one.used for one in every)
     error = torch.cat([one.error_deg for one in every])
     wrong = int((error > WRONG_DEG).sum())
@@ -146,13 +145,13 @@ def row(name: str, every: list[Solved], count: int) -> str:
 
 
 def errors_deg(R: Tensor, truth: Path) -> Tensor:
-    """Return the angles to the truth, the best rotation of the body frame taken off, of those that are known."""
+    """Return the angles of known attitudes to the truth, after the best rotation of the body frame."""
     with h5py.File(truth) as file:
         true = torch.from_numpy(file["orientation"][()])
     known = torch.isfinite(R).flatten(1).all(1)
     if not known.any():
         return torch.zeros(0, dtype=torch.float64)
-    # Of many: a wrong one must not turn all others.
+    # Best of many: a wrong attitude must not rotate all others.
     tried = R[known].mT @ true[known]
     apart = so3.geodesic_distance((R[known] @ tried[:, None]), true[known])
     Q = tried[int(apart.median(1).values.argmin())]
@@ -186,9 +185,9 @@ def learnt(experiment: Path) -> Solved:
     words = [sys.executable, "-m", "sphereorient.cli", "map", str(experiment), "--out", str(texture)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
     process = subprocess.Popen([*words, "--photographs", "--quiet"], env=environment)
-    _, status, usage = os.wait4(process.pid, 0)  # tells the time of this one child
+    _, status, usage = os.wait4(process.pid, 0)  # time of this child
     cpu_s = usage.ru_utime + usage.ru_stime
-    if status:  # it has said why
+    if status:  # its message is printed
         return Solved(used=0, error_deg=torch.zeros(0, dtype=torch.float64), map_rms_deg=np.nan, cpu_s=cpu_s)
     track = Trajectory.load(texture.with_name("learnt_map.h5"))
     R = torch.from_numpy(np.where(track.valid[:, None, None], track.orientation, np.nan))

@@ -1,10 +1,10 @@
-"""Print how well the dots of a plate are found, told and measured in the pictures of an exact calibration.
+"""Measure how well the dots of a plate are found, identified and located in the pictures of an exact calibration.
 
 scripts/plate_pictures.py ../shared/experiment
 
 The folder holds cameras.yaml (exact) and calibration/ with calibration.yaml, the pictures and truth.h5 (exact poses).
-A dot lies wholly in a picture where its rim does. `told wrong` counts dots farther than a pixel from where their grid
-index says. The last two columns are measured minus exact pictures of the dots' centres, rms of u and v together, first
+A dot lies wholly in a picture where its rim does. `misplaced` counts dots farther than a pixel from their grid index's
+position. The last two columns are measured minus exact pictures of the dots' centres, rms of u and v together, first
 as measured, then less the perspective bias.
 """
 
@@ -61,13 +61,13 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     folder = parser.parse_args().folder
     cameras = load_cameras(folder / "cameras.yaml")
-    said = yaml.safe_load((folder / "calibration" / "calibration.yaml").read_text())
-    plate = plate_from_entry(said["plate"])
+    document = yaml.safe_load((folder / "calibration" / "calibration.yaml").read_text())
+    plate = plate_from_entry(document["plate"])
     with h5py.File(folder / "calibration" / "truth.h5") as truth:
         R, T = (torch.from_numpy(truth[name][:]) for name in ("R_lab_plate", "T_lab_plate"))
-    table = Table("picture", "state", "in picture", "found", "not in picture", "told wrong", "rms px", "less bias", "s")
+    table = Table("picture", "state", "in picture", "found", "not in picture", "misplaced", "rms px", "less bias", "s")
     totals = {name: [0, 0, 0, 0, [], []] for name in cameras}
-    for entry in said["pictures"]:
+    for entry in document["pictures"]:
         for name in (name for name in cameras if name in entry):
             pose = (R[entry["pose"]], T[entry["pose"]])
             picture = cv2.imread(str(folder / "calibration" / entry[name]), cv2.IMREAD_UNCHANGED)
@@ -75,10 +75,10 @@ def main() -> None:
             view = see_plate(picture, plate, entry[name])
             spent = process_time() - start
             there = wholly_inside(cameras[name], *pose, plate)
-            told = {(int(i), int(j)) for i, j in view.index}
+            seen = {(int(i), int(j)) for i, j in view.index}
             raw, corrected = misses(cameras[name], *pose, view)
             wrong = np.abs(raw).max(axis=1, initial=0.0) > 1
-            counts = [len(there), len(told & there), len(told - there), int(wrong.sum())]
+            counts = [len(there), len(seen & there), len(seen - there), int(wrong.sum())]
             total = totals[name]
             total[:4] = [a + b for a, b in zip(total[:4], counts, strict=True)]
             total[4].append(raw[~wrong])

@@ -1,4 +1,4 @@
-"""What cameras without a port cost in a tank: calibrated from the same plate pictures, with the wall and without it.
+"""Measure the cost of cameras without a port in a tank: calibrated from the same plate pictures, with and without wall.
 
     scripts/port_or_not.py EXPERIMENT_FOLDER [--figure port_or_not.png]
 
@@ -35,7 +35,7 @@ COLOURS = {"exact cameras": "#444444", "calibrated, with port": "#009E73", "cali
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Case:
-    """One set of cameras and what became of it."""
+    """One set of cameras and its results."""
 
     rms_px: Mapping[str, float]
     cameras: Mapping[str, Camera]
@@ -53,7 +53,7 @@ def main() -> None:
     experiment = load_experiment(folder / "experiment.yaml")
     document = load_calibration(folder / "calibration" / "calibration.yaml")
     found = {"calibrated, with port": calibrate_cameras(document)}
-    with mock.patch("sphereorient.calibration.plates.doubts", return_value={}):  # else it is refused: what that saves
+    with mock.patch("sphereorient.calibration.plates.doubts", return_value={}):  # else it is refused
         found["calibrated, without port"] = calibrate_cameras(replace(document, ports={}))
     sets: dict[str, tuple[Mapping[str, Camera], Mapping[str, float]]] = {"exact cameras": (experiment.cameras, {})}
     for name, result in found.items():
@@ -90,13 +90,13 @@ def table(cases: Mapping[str, Case], exact: Mapping[str, Camera]) -> None:
 
 
 def volume(count: int) -> np.ndarray:
-    """Return a lattice of places in the cube, (count^3, 3) mm."""
+    """Return a lattice of points in the cube, (count^3, 3) mm."""
     at = np.linspace(-HALF_SIZE_MM, HALF_SIZE_MM, count)
     return np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def errors_mm(cameras: Mapping[str, Camera], exact: Mapping[str, Camera], places: np.ndarray) -> np.ndarray:
-    """Return where cameras see places that the exact ones show, less the places, (n, 3)."""
+    """Return positions by `cameras` of points in the exact cameras' pictures, less the points, (n, 3)."""
     one, other = list(exact)
     x = torch.from_numpy(places)
     middle, _ = triangulate(*(cameras[name].rays(exact[name].project(x)) for name in (one, other)))

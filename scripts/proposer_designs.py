@@ -2,12 +2,12 @@
 
     scripts/proposer_designs.py [--minutes 10] [--designs correlator,descriptor,classifier]
 
-correlator: features of the picture against features of the map, turned with it (what is shipped).
-descriptor: one vector of a picture, from a network that sees pictures and clean views alike; the map's views a bank.
-classifier: logits on the grid straight from the picture; learns one ball by heart and knows no other.
+correlator: features of the picture against features of the map, rotated with it (shipped).
+descriptor: one vector per picture, from one network for pictures and clean views; the map's views are a bank.
+classifier: logits on the grid directly from the picture; learns one ball and works for no other.
 
 Prints recall within 10 degrees among the first and the first five, on the same mixed pictures (up to three
-degradations, levels up to 5) of balls that training has not seen; for the classifier, of the ball that it knows.
+degradations, levels up to 5) of balls that training has not seen; for the classifier, of its own ball.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class CorrelatorDesign(Design):
 
 
 class Vector(nn.Module):
-    """A picture as one vector."""
+    """Network from a picture to one vector."""
 
     def __init__(self, outputs: int) -> None:
         super().__init__()
@@ -74,7 +74,7 @@ class Vector(nn.Module):
 
 
 class DescriptorDesign(Design):
-    """Vectors of pictures and of clean views of the map."""
+    """Compare vectors of pictures and of clean views of the map."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -89,14 +89,14 @@ class DescriptorDesign(Design):
         return self.gain.exp() * F.normalize(self.vector(disks), dim=1) @ bank.T
 
     def clean(self, texture: Tensor, R: Tensor) -> Tensor:
-        """Views of the map under even light, (K, S, S)."""
+        """Return views of the map under even light, (K, S, S)."""
         paint = self.view.paint(reduced_texture(texture, 40), R)
         black, white = VIEW_LEVELS
         return self.view.picture(black + (white - black) * paint, outside=black)
 
 
 class ClassifierDesign(Design):
-    """Logits straight from the picture."""
+    """Logits directly from the picture."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -154,7 +154,7 @@ def train(design: Design, balls: RandomTextures, settings: PictureSettings, seco
 
 
 def loss_of(design: Design, balls: RandomTextures, lesson: TrainingBatch, m: int, rng: torch.Generator) -> Tensor:
-    """Cross entropy with what is right, spread over the grid."""
+    """Return the cross entropy with the right rotations, spread over the grid."""
     some = None
     if isinstance(design, DescriptorDesign):  # a bank of all views takes ten times the time of the rest
         near = lesson.R_view_body[m]
@@ -169,7 +169,7 @@ def loss_of(design: Design, balls: RandomTextures, lesson: TrainingBatch, m: int
 
 @torch.inference_mode()
 def judge(design: Design, balls: RandomTextures, settings: PictureSettings) -> tuple[float, float, float]:
-    """Return recall of the first and the first five, and CPU seconds per picture beyond the map's own work."""
+    """Return recall of the first and the first five, and CPU seconds per picture without the map's part."""
     rng = torch.Generator().manual_seed(2)
     ranks, seconds, count = [], 0.0, 0
     for _ in range(12):

@@ -1,11 +1,10 @@
-"""A ball that others filmed: map and attitudes learnt from the movie alone, compared with FicTrac's result.
+"""Learn map and attitudes from FicTrac's sample movie alone, and compare them with FicTrac's result.
 
     scripts/real_fictrac.py [--folder ../shared/real/fictrac] [--work FOLDER] [--set paint.rounds=20] [--no-track]
 
-One camera of which only the field of view is known, a ball that turns in one place, of unknown size, hidden in part by
-the fly and by its holder. Prints numbers; nothing of the movie is kept (but in --work, where one is given). FicTrac's
-rotations are those of README.txt there: its q_factors 4, 6 and 10 are compared with each other as well, which tells
-whose noise a difference is.
+Of the camera only the field of view is known; the ball is fixed, of unknown size, and partly hidden by the fly and its
+holder. Prints numbers; keeps files only in --work. FicTrac's rotations are those of README.txt there: its q_factors 4,
+6 and 10 are also compared with each other, to separate FicTrac's noise from ours.
 """
 
 from __future__ import annotations
@@ -71,14 +70,14 @@ def write_inputs(folder: Path, source: Path, texture: str = "", name: str = "exp
     for polygon in ignored(source / "config.txt"):
         cv2.fillPoly(mask, [polygon], 0)
     cv2.imwrite(str(folder / "mask.png"), mask)
-    said = f", texture: {texture}" if texture else ""
+    entry = f", texture: {texture}" if texture else ""
     path = folder / name
-    path.write_text(EXPERIMENT.format(FRAME_RATE, (source / "sample.mp4").resolve(), said))
+    path.write_text(EXPERIMENT.format(FRAME_RATE, (source / "sample.mp4").resolve(), entry))
     return path
 
 
 def ignored(config: Path) -> list[NDArray[np.int32]]:
-    """Read the polygons that FicTrac was told to ignore, each (n, 2), px."""
+    """Read FicTrac's `roi_ignr` polygons, each (n, 2), px."""
     line = next(text for text in config.read_text().splitlines() if text.startswith("roi_ignr"))
     groups = re.findall(r"\{([^{}]+)\}", line)
     return [np.array([int(number) for number in group.split(",")], np.int32).reshape(-1, 2) for group in groups]
@@ -90,7 +89,7 @@ def fictrac_turns(path: Path, turned: bool = True) -> torch.Tensor:
     Args:
         path: its .dat file.
         turned: whether to take the vectors from the frame about the ball's line of sight, in which FicTrac measures
-            (README.txt, note 2), to the camera's; else they are as they stand.
+            (README.txt, note 2), to the camera's; else they are unchanged.
     """
     table = np.loadtxt(path, delimiter=",")
     turns = torch.from_numpy(table[1:, 1:4])
@@ -116,23 +115,23 @@ def apart_deg(a: torch.Tensor, b: torch.Tensor) -> Floats:
     return angle[np.isfinite(angle)]
 
 
-def told(name: str, values: Floats) -> None:
+def show(name: str, values: Floats) -> None:
     """Print median and 95th percentile."""
     print(f"  {name:42} median {np.median(values):.3f}   95 % {np.percentile(values, 95):.3f}   degrees")
 
 
 def compare_turns(ours: torch.Tensor, source: Path) -> None:
-    """Print how far our turns and FicTrac's are apart, and how far its settings are from each other."""
+    """Print differences of our rotations from FicTrac's, and between FicTrac's settings."""
     theirs = {q: fictrac_turns(source / f"fictrac_q{q}.dat") for q in FACTORS}
     print("turn from frame to frame, differences (camera axes):")
     for q in reversed(FACTORS):
-        told(f"ours - FicTrac q{q}", apart_deg(ours, theirs[q]))
-    told(
+        show(f"ours - FicTrac q{q}", apart_deg(ours, theirs[q]))
+    show(
         "ours - FicTrac q10, its vectors as they stand",
         apart_deg(ours, fictrac_turns(source / "fictrac_q10.dat", False)),
     )
-    told("FicTrac q6 - q10", apart_deg(theirs[6], theirs[10]))
-    told("FicTrac q4 - q6", apart_deg(theirs[4], theirs[6]))
+    show("FicTrac q6 - q10", apart_deg(theirs[6], theirs[10]))
+    show("FicTrac q4 - q6", apart_deg(theirs[4], theirs[6]))
     # Three series, pairwise differences: each one's own noise, were they independent (three-cornered hat).
     a, b, c = ours, theirs[10], theirs[6]
     good = torch.isfinite(a).all(-1)
@@ -150,19 +149,19 @@ def compare_turns(ours: torch.Tensor, source: Path) -> None:
 
 
 def compare_attitudes(R_lab_body: torch.Tensor, source: Path) -> None:
-    """Print how far absolute attitudes are apart, the best rotation on both sides taken off, along the movie."""
-    print("absolute attitude, best constant rotations taken off:")
+    """Print differences of absolute attitudes along the movie, after the best rotation on both sides."""
+    print("absolute attitude, after the best constant rotations:")
     valid = torch.isfinite(R_lab_body).flatten(1).all(1)
     for q in reversed(FACTORS):
         theirs = torch.from_numpy(np.loadtxt(source / f"fictrac_q{q}.dat", delimiter=",")[:, FICTRAC["rotation_cam"]])
         C = to_cone()
         R = C @ so3.exp(theirs) @ C.mT
-        told(f"ours - FicTrac q{q}", np.rad2deg(so3.geodesic_distance(*aligned(R[valid], R_lab_body[valid])).numpy()))
+        show(f"ours - FicTrac q{q}", np.rad2deg(so3.geodesic_distance(*aligned(R[valid], R_lab_body[valid])).numpy()))
     a, b = (
         so3.exp(torch.from_numpy(np.loadtxt(source / f"fictrac_q{q}.dat", delimiter=",")[:, FICTRAC["rotation_cam"]]))
         for q in (6, 10)
     )
-    told("FicTrac q6 - q10", np.rad2deg(so3.geodesic_distance(*aligned(a, b)).numpy()))
+    show("FicTrac q6 - q10", np.rad2deg(so3.geodesic_distance(*aligned(a, b)).numpy()))
 
 
 def aligned(R: torch.Tensor, other: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -205,7 +204,7 @@ def print_ball(learnt: LearntMap) -> None:
 
 
 def print_drift(learnt: LearntMap, chain: torch.Tensor) -> None:
-    """Print what closing loops did."""
+    """Print the effect of closing loops."""
     closure = learnt.closure
     before, after = np.rad2deg([closure.drift_before_rad, closure.drift_after_rad])
     print(
@@ -234,7 +233,7 @@ def main() -> None:
     """Learn, track, compare."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--folder", type=Path, default=REPO.parent / "shared" / "real" / "fictrac")
-    parser.add_argument("--work", type=Path, help="keep everything here, with a figure; outside of the project")
+    parser.add_argument("--work", type=Path, help="keep all files here, with a figure; outside of the project")
     parser.add_argument("--set", action="append", default=[], dest="overrides")
     parser.add_argument("--no-track", action="store_true", help="the learnt attitudes only")
     options = parser.parse_args()
@@ -262,7 +261,7 @@ def main() -> None:
 
 
 def tracked(folder: Path, source: Path) -> None:
-    """Track the whole movie with the learnt map, frame by frame, and compare the same."""
+    """Track the whole movie with the learnt map, frame by frame, and compare its attitudes."""
     path = write_inputs(folder, source, "texture.png", "with_map.yaml")
     begun = time.perf_counter()
     command = [sys.executable, "-m", "sphereorient.cli", "track", str(path), "--quiet"]

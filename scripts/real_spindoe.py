@@ -1,4 +1,4 @@
-"""Print what 22 photographs of a real ball with dots tell of its spin, beside the reference that comes with them.
+"""Measure the spin of a real ball with dots from 22 photographs, beside the reference that comes with them.
 
     scripts/real_spindoe.py [FOLDER]
 
@@ -84,17 +84,17 @@ def spins(found: SpinEstimate, rate_reference: float) -> None:
     for k, (omega, rate) in enumerate(zip(found.spins.omega_view_rad_s.tolist(), rates.tolist(), strict=True)):
         which = f"one of {found.ambiguous} that the times allow" if k < found.ambiguous else "less likely"
         off = f", {100 * (rate / rate_reference - 1):+.2f} % of the reference" if k == 0 else ""
-        told = ", ".join(f"{each:.1f}" for each in omega)
+        axes = ", ".join(f"{each:.1f}" for each in omega)
         sigma = float(found.spins.rate_sigma()[k])
         print(
-            f"omega ({told}) rad/s, |omega| {rate:.1f} +- {sigma:.1f} = {rate / (2 * math.pi):.1f} revolutions/s{off}: "
+            f"omega ({axes}) rad/s, |omega| {rate:.1f} +- {sigma:.1f} = {rate / (2 * math.pi):.1f} revolutions/s{off}: "
             f"{which}, evidence {float(found.spins.evidence[k]):.0f}"
         )
     print(f"mirrored table: evidence {found.mirrored_evidence:.0f}")
 
 
 def reference_rate(reference: Tensor, time_s: Tensor) -> float:
-    """|omega| of the reference's own even spin: its attitudes turn alike between any two photographs a step apart."""
+    """Return |omega| of the reference's constant spin, from the rotation between photographs one step apart."""
     turn = so3.angle(reference[1:] @ reference[:-1].mT)
     gap = time_s.diff()
     near = gap < 1.5 * gap.min()

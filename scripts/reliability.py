@@ -1,10 +1,10 @@
-"""Measure whether the confidence of a track keeps what it promises, on scenes with several things wrong at once.
+"""Measure the calibration of a track's confidence, on scenes with several degradations at once.
 
     scripts/reliability.py [--scenes 96] [--jobs 2] [--out out/reliability]
 
 Renders mixed scenes of the robustness benchmark (three degradations each, levels 1 to 5 in turn, seeds that the
 benchmark does not use), tracks them with `precise`, and compares the confidence of each frame's orientation with
-whether it is within 10 degrees of the truth. A run that was cut off goes on. A quarter of an hour on two cores.
+whether it is within 10 degrees of the truth. An interrupted run continues. A quarter of an hour on two cores.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def main() -> None:
             tasks, options.out / CACHE, options.jobs, lambda left: advance("scenes", len(scenes) - left, len(scenes))
         )
     outcomes = [one for place in places for one in kept_results(place)]
-    tell(outcomes)
+    print_reliability(outcomes)
 
 
 def mixed_scenes(count: int) -> list[BenchmarkScene]:
@@ -58,24 +58,24 @@ def mixed_scenes(count: int) -> list[BenchmarkScene]:
     return found[:count]
 
 
-def tell(outcomes: list[SceneResult]) -> None:
-    """Print the reliability and draw its curve."""
+def print_reliability(outcomes: list[SceneResult]) -> None:
+    """Print the reliability and the wrong scenes."""
     refused = [one for one in outcomes if one.refused]
     claimed, right = [], []
     for one in outcomes:
-        for said, error in zip(one.confidence, one.errors_deg.tolist(), strict=True):
-            if said is not None and np.isfinite(error):
-                claimed.append(said)
+        for confidence, error in zip(one.confidence, one.errors_deg.tolist(), strict=True):
+            if confidence is not None and np.isfinite(error):
+                claimed.append(confidence)
                 right.append(error <= WRONG_DEG)
     found = reliability(claimed, right)
     print(f"{len(outcomes)} scenes, {len(refused)} of them refused; {len(claimed)} frames with an orientation")
     print(f"within {WRONG_DEG:g} degrees: {np.mean(right):.4f}; mean confidence {np.mean(claimed):.4f}")
     print(f"expected calibration error {found.error:.4f}; by chance {found.chance:.4f}")
     print("confidence, share right (95 % interval), frames")
-    for said, share, low, high, count in zip(
+    for confidence, share, low, high, count in zip(
         found.probability, found.share, found.low, found.high, found.count, strict=True
     ):
-        print(f"{said:8.4f} {share:8.4f} ({low:.4f} to {high:.4f}) {count:6d}")
+        print(f"{confidence:8.4f} {share:8.4f} ({low:.4f} to {high:.4f}) {count:6d}")
     for one in outcomes:
         if one.wrong:
             print(f"{one.scene}: {one.wrong} wrong of {one.frames - one.lost}: {dict(one.degradations)}")

@@ -2,8 +2,8 @@
 
     scripts/reproduce_paper.py --out DIR [--quick] [--docs]
 
-DIR/movies and DIR/tracks keep what is done, each beside what it was made of: a killed run continues, and what changed
-code made is made anew. DIR/paper.md is the page. `--quick` films 3 x 90 frames instead of 40 x 375. `--docs` copies
+DIR/movies and DIR/tracks keep results with their records: an interrupted run continues, and results of changed code are
+made anew. DIR/paper.md is the page. `--quick` films 3 x 90 frames instead of 40 x 375. `--docs` copies
 page and pictures into docs/.
 """
 
@@ -56,7 +56,7 @@ QUICK = Plan(
     statistics=StatisticsSettings(integral_time_s=T_L_S, min_frames=20, min_integral_times=0.1, resamples=200),
 )
 METHODS = ("paper", "precise")
-# What `paper` imports and does not run: tests/end_to_end/test_reproduce_paper.py runs it to see.
+# Modules that `paper` imports and does not run, as tests/end_to_end/test_reproduce_paper.py checks.
 NOT_OF_PAPER = ("follow", "pose", "mapping", "learn", "methods.precise", "methods.paint")
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 DPI, LARGEST_BYTES = 130, 3_000_000  # of the pictures
@@ -69,7 +69,7 @@ def made_by(out: Path, number: int, stage: str) -> Path:
 
 @lru_cache(maxsize=1)
 def code() -> dict[str, str]:
-    """Return a word for the code of each stage: a film does not change with a tracker, nor `paper` with `precise`."""
+    """Return a digest of each stage's code: films do not depend on trackers, nor `paper` on `precise`."""
     stages = kept.rooms.modules()
     track = [stages["run.stages"], stages["methods.paper"]]
     return {
@@ -80,12 +80,12 @@ def code() -> dict[str, str]:
 
 
 def key_of(number: int, stage: str, frames: int) -> str:
-    """Return what the work of a stage depends on, as one word."""
+    """Return a digest of everything that the work of a stage depends on."""
     return " ".join([f"{number} {frames}", code()["film"], *([code()[stage]] if stage != "film" else [])])
 
 
 def todo(out: Path, plan: Plan, stages: Sequence[str]) -> list[tuple[int, str]]:
-    """Return what is to be made, movie and stage; BenchError for a folder in the way that no run has made."""
+    """Return the missing results, movie and stage; BenchError for a folder that no run has made."""
     missing = []
     for number, stage in product(range(1, plan.movies + 1), stages):
         made = made_by(out, number, stage)
@@ -100,7 +100,7 @@ def todo(out: Path, plan: Plan, stages: Sequence[str]) -> list[tuple[int, str]]:
 
 
 def make(out: Path, number: int, stage: str, frames: int, key: str) -> None:
-    """Film a movie or track it, and note what it was made of; a refusal of a method is a result."""
+    """Film a movie or track it, and write its record; a refusal of a method is a result."""
     torch.set_num_threads(1)
     limit_cores(1)
     made, failed = made_by(out, number, stage), ""
@@ -124,14 +124,14 @@ def make(out: Path, number: int, stage: str, frames: int, key: str) -> None:
     words = {"key": key, "failed": failed, "wall_s": round(wall_s, 1), "cpu_s": round(cpu_s, 1)}
     kept.note(aside if stage == "film" else made, **words)
     if stage == "film":
-        aside.rename(made)  # a movie that is there is whole
+        aside.rename(made)  # a movie under this name is complete
     print(f"movie {number:03d}: {stage:8} {wall_s:5.0f} s, {cpu_s:5.0f} s of CPU", file=sys.stderr, flush=True)
 
 
 def make_movies(out: Path, plan: Plan, methods: Sequence[str] = METHODS) -> None:
     """Film all movies, then track them, the methods side by side on all cores.
 
-    What is there and made by the code as it is stays.
+    Results of the present code stay.
     """
     for part in ("movies", "tracks"):
         make_folder(out / part, f"folder {out / part}")
@@ -148,8 +148,8 @@ def make_movies(out: Path, plan: Plan, methods: Sequence[str] = METHODS) -> None
                     future.result()
                     minutes = (time.perf_counter() - begin) / 60
                     left = minutes / done * (len(making) - done)
-                    said = f"{' and '.join(stages)}: {done} of {len(making)}, {minutes:.0f} min, {left:.0f} min left"
-                    print(said, file=sys.stderr, flush=True)
+                    message = f"{' and '.join(stages)}: {done} of {len(making)}, {minutes:.0f} min, {left:.0f} min left"
+                    print(message, file=sys.stderr, flush=True)
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise

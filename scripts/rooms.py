@@ -62,7 +62,7 @@ def arrows() -> dict[str, set[str]]:
     known = modules()
     found: dict[str, set[str]] = defaultdict(set)
     for name, path in known.items():
-        if name:  # the front door hands out names of all rooms, on demand
+        if name:  # sphereorient/__init__.py exports names of all rooms, on demand
             found[room(name)] |= {room(other) for other in imports(path, known)} - {room(name)}
     return found
 
@@ -125,7 +125,7 @@ def sentence(name: str) -> str:
 
 
 def ceilings() -> dict[str, int]:
-    """Return how many lines each room may have, as CONTRIBUTING.md says."""
+    """Return the largest number of lines of each room, from CONTRIBUTING.md."""
     rows = re.findall(r"^\| `(\w+)` \|.*\| ([\d,]+) \|$", (REPO / "CONTRIBUTING.md").read_text(), re.MULTILINE)
     return {name: int(number.replace(",", "")) for name, number in rows}
 
@@ -152,7 +152,7 @@ def counts() -> dict[str, int]:
 
 
 def _numbers(node: ast.stmt) -> int:
-    """Return how many names a statement of a module gives to numbers, or to tuples and tables of numbers."""
+    """Return how many names a statement of a module assigns to numbers, or to tuples and tables of numbers."""
     targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
     leaves = [leaf for leaf in ast.walk(node.value) if isinstance(leaf, ast.Constant | ast.Name)] if targets else []
     if not leaves or any(isinstance(leaf, ast.Name) or type(leaf.value) not in (int, float) for leaf in leaves):

@@ -1,8 +1,8 @@
-"""Cameras bumped after their calibration, repaired by the ball itself: how much is left of the bump.
+"""Measure the error that remains after cameras are bumped and then repaired by the ball itself.
 
     scripts/self_calibration.py EXPERIMENT_FOLDER [--cases 20] [--turn 0.3] [--move 0.5]
 
-Each case turns both cameras by an angle (degrees) about random axes and moves their centres (mm) in random directions,
+Each case rotates the cameras by an angle (degrees) about random axes and moves their centres (mm) in random directions,
 seeded; tracks the movies with them; repairs them with that track. Prints Markdown: relative rotation of the cameras
 against the exact ones before and after, and rms distance of the lines of sight to the ball's centre before, after and
 with the exact cameras.
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def bump(cameras: Mapping[str, Camera], turn_rad: float, move_mm: float, seed: int) -> dict[str, Camera]:
-    """Return cameras turned about their own centres and moved, in random directions."""
+    """Return cameras rotated about their own centres and moved, in random directions."""
     rng = torch.Generator().manual_seed(seed)
     bumped = {}
     for name, camera in cameras.items():
@@ -66,14 +66,14 @@ def bump(cameras: Mapping[str, Camera], turn_rad: float, move_mm: float, seed: i
 
 
 def apart_rad(cameras: Mapping[str, Camera], exact: Mapping[str, Camera]) -> float:
-    """Angle between the relative rotations of two pairs of cameras."""
+    """Return the angle between the relative rotations of two pairs of cameras."""
     one, other = list(exact)
     relative = [pair[one].R_cam_lab @ pair[other].R_cam_lab.mT for pair in (cameras, exact)]
     return float(so3.geodesic_distance(*relative))
 
 
 def gap_mm(cameras: Mapping[str, Camera], track: Trajectory) -> float:
-    """Root mean square of the distance of the lines of sight."""
+    """Return the root mean square of the distance of the lines of sight."""
     (check,) = check_cameras(cameras, track)
     return float((check.gap_mm**2).mean() ** 0.5)
 

@@ -79,7 +79,7 @@ class Case:
     reported: Callable[[Cameras], Cameras] | None = None
     document: Callable[[dict[str, Any]], None] | None = None
     texture: Callable[[Tensor], Tensor] | None = None  # the filmed paint of the map (H, 2 H)
-    told: Callable[[Path], None] | None = None  # changes files of the folder
+    edit: Callable[[Path], None] | None = None  # of the folder's files
 
 
 # What is wrong with a picture
@@ -90,7 +90,7 @@ def shifted(picture: NDArray[np.float32], right: float, down: float) -> NDArray[
 
 
 def second_ball(right: float, down: float, later_s: float, faint: float = 1.0) -> Callable[[Moment], Any]:
-    """Another ball with the same paint, some px away, in the attitude of another time."""
+    """Add another ball with the same paint, some px away, in the attitude of another time."""
 
     def change(at: Moment) -> NDArray[np.float32]:
         lit, cover = (shifted(part, right, down) for part in at.film(at.time_s + later_s))
@@ -101,13 +101,13 @@ def second_ball(right: float, down: float, later_s: float, faint: float = 1.0) -
 
 
 def plain_ball(at: Moment) -> NDArray[np.float32]:
-    """A white ball without paint beside the painted one."""
+    """Add a white ball without paint beside the painted one."""
     cover = shifted(at.cover, 95, -60)
     return at.lit * (1 - cover) + 120 * cover
 
 
 def rod(at: Moment) -> NDArray[np.float32]:
-    """A grey rod that holds the ball from above, in front of it."""
+    """Add a grey rod that holds the ball from above, in front of it."""
     picture = at.lit.copy()
     x, y = at.centre_px
     cv2.line(
@@ -153,7 +153,7 @@ def interlaced(at: Moment) -> NDArray[np.float32]:
 
 
 def reflection(at: Moment) -> NDArray[np.float32]:
-    """A mirrored, dimmer picture of the ball in a wall."""
+    """Add a mirrored, dimmer picture of the ball in a wall."""
     cover = shifted(at.cover[:, ::-1].copy(), 20, 90)
     lit = shifted(at.lit[:, ::-1].copy(), 20, 90)
     return np.asarray(at.lit + 0.35 * cover * lit, np.float32)
@@ -243,7 +243,7 @@ def flipped(camera: str, how: str) -> Callable[[dict[str, Any]], None]:
 
 
 def turned(name: str, deg: float, axis: int = 0) -> Callable[[Cameras], Cameras]:
-    """Turn a reported camera about its own centre."""
+    """Rotate a reported camera about its own centre."""
 
     def change(cameras: Cameras) -> Cameras:
         one = cameras[name]
@@ -258,7 +258,7 @@ def turned(name: str, deg: float, axis: int = 0) -> Callable[[Cameras], Cameras]
 
 
 def wide_pixels(share: float, names: tuple[str, ...] = ("cam1", "cam2")) -> Callable[[Cameras], Cameras]:
-    """Report pixels as square that are wider than high."""
+    """Report square pixels for pixels that are wider than high."""
 
     def change(cameras: Cameras) -> Cameras:
         found = dict(cameras)
@@ -293,15 +293,15 @@ def unseen(folder: Path) -> None:
 
 
 def map_of(change: Callable[[Grey], Grey]) -> Callable[[Path], None]:
-    def tell(folder: Path) -> None:
+    def edit(folder: Path) -> None:
         grey = cv2.imread(str(folder / "texture.png"), cv2.IMREAD_GRAYSCALE)
         write_picture(folder / "texture.png", np.ascontiguousarray(change(grey)))
 
-    return tell
+    return edit
 
 
 def warped(grey: Grey) -> Grey:
-    """Latitudes off by up to 3 degrees, as a map painted by hand is; one wave only would be a turned body frame."""
+    """Shift latitudes by up to 3 degrees, as in a map painted by hand; one wave only would rotate the body frame."""
     height, width = grey.shape
     v, u = np.indices(grey.shape, dtype=np.float32)
     off = 3 / 180 * height * np.sin(4 * np.pi * u / width).astype(np.float32)
@@ -317,7 +317,7 @@ def two_fold(texture: Tensor) -> Tensor:
 
 
 def spinning(deg: float) -> Callable[[Motion6D], Motion6D]:
-    """The same turn from frame to frame about one axis, on top of the motion."""
+    """Add a constant rotation from frame to frame about one axis to the motion."""
 
     def change(motion: Motion6D) -> Motion6D:
         turns = motion.time_s * 600 * np.radians(deg)
@@ -403,7 +403,7 @@ CASES = (
     ),
     Case(
         name="rolled_cam2_1.5",
-        what="the second camera turned about its axis",
+        what="the second camera rotated about its axis",
         measurable=False,
         reported=turned("cam2", 1.5, 2),
     ),
@@ -423,16 +423,16 @@ CASES = (
     Case(name="big_250", what="a ball of 250 px", scene=big(250.0, 600)),
     Case(name="big_400", what="a ball of 400 px", scene=big(400.0, 900)),
     Case(name="frames_2000", what="pictures of 2000 px", scene={"image_size": (2000, 2000), "frames": 10}),
-    Case(name="unseen", what="part of the map never seen", told=unseen),
-    Case(name="warped_map", what="a map warped by up to 3 degrees", measurable=False, told=map_of(warped)),
-    Case(name="mirrored_map", what="a mirrored map", measurable=False, told=map_of(lambda grey: grey[:, ::-1])),
-    Case(name="upside_down", what="a map upside down", measurable=False, told=map_of(lambda grey: grey[::-1])),
-    Case(name="inverted_map", what="black and white exchanged", measurable=False, told=map_of(lambda grey: 255 - grey)),
+    Case(name="unseen", what="part of the map never seen", edit=unseen),
+    Case(name="warped_map", what="a map warped by up to 3 degrees", measurable=False, edit=map_of(warped)),
+    Case(name="mirrored_map", what="a mirrored map", measurable=False, edit=map_of(lambda grey: grey[:, ::-1])),
+    Case(name="upside_down", what="a map upside down", measurable=False, edit=map_of(lambda grey: grey[::-1])),
+    Case(name="inverted_map", what="black and white exchanged", measurable=False, edit=map_of(lambda grey: 255 - grey)),
     Case(
         name="other_map",
         what="a map of another ball",
         measurable=False,
-        told=map_of(lambda g: np.roll(g[::-1, ::-1], 200, 0)),
+        edit=map_of(lambda g: np.roll(g[::-1, ::-1], 200, 0)),
     ),
     Case(name="two_fold", what="two-fold paint; pictures cannot decide", measurable=False, texture=two_fold),
     Case(
@@ -520,8 +520,8 @@ def film(folder: Path, case: Case) -> Path:
     document = experiment_document(settings, cameras, ".npy")
     if case.document:
         case.document(document)
-    if case.told:
-        case.told(folder)
+    if case.edit:
+        case.edit(folder)
     path = folder / "experiment.yaml"
     path.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
     return path
@@ -569,7 +569,7 @@ def pictures(
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What a track of a case states, frame by frame counted."""
+    """Counts of frames of a case's track."""
 
     name: str
     refused: str = ""

@@ -2,8 +2,8 @@
 
     scripts/single_stills.py [--stills 6] [--out out/single-stills]
 
-For each kind of paint and degradation one movie of one camera whose frames show unrelated orientations; of each some
-frames, as an experiment of one picture. Prints how many are measured within 5 degrees, measured wrongly, and refused,
+Renders a movie of one camera with unrelated orientations for each kind of paint and degradation, and tracks some
+frames of each as a single picture. Prints how many are measured within 5 degrees, measured wrongly, and refused,
 with their confidence. Three quarters of an hour on one core.
 """
 
@@ -44,7 +44,7 @@ DEGRADATIONS = {
 KINDS = ("its map", "mirrored", "map of another ball")
 SCENE = {"frames": 6, "frame_rate": 20.0, "cameras": 1, "image_size": (200, 200), "volume_mm": 8.0, "ambient": 0.3}
 RIGHT_DEG = 5.0
-Row = tuple[str, float, float, bool]  # what became of it, error in degrees, confidence, whether it is ambiguous
+Row = tuple[str, float, float, bool]  # outcome, error in degrees, confidence, whether it is ambiguous
 
 
 def main() -> None:

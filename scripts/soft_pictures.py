@@ -1,9 +1,10 @@
-"""Does a run learn the light and the errors of soft pictures as well as when it is told their blur?
+"""Compare tracks of soft pictures with learnt blur and with given blur.
 
     scripts/soft_pictures.py [--shared ../shared] [--frames 110] [--blurs 0.5 0.95 2] [--work FOLDER]
 
-Lays a Gaussian over the first frames of the path-traced experiment, puts sensor noise back, and tracks each twice:
-nothing given, and the exact blur given. Prints one Markdown table: median error and error over sigma of each.
+Blurs the first frames of the path-traced experiment by a Gaussian, restores the sensor noise, and tracks each movie
+twice: with nothing given, and with the exact blur. Prints one Markdown table: median error and error over sigma of
+each.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ REACH = 4  # sigmas of the Gaussian
 
 
 def blurred(frames: Iterable[NDArray[np.generic]], blur_px: float, seed: int) -> Iterator[NDArray[np.uint8]]:
-    """Yield frames under a Gaussian, with the share of the sensor's noise put back that it takes away."""
+    """Yield frames blurred by a Gaussian, with the lost share of the sensor's noise restored."""
     rng = np.random.default_rng(seed)
     width = 2 * math.ceil(REACH * blur_px) + 1
     kernel = cv2.getGaussianKernel(width, blur_px)

@@ -1,13 +1,13 @@
-"""Measure whether stated errors hold: what differs from frame to frame, and what lasts over a movie, each by itself.
+"""Compare stated with true errors: the part that varies from frame to frame, and the part that lasts over a movie.
 
     scripts/stated_errors.py SHARED_FOLDER [--only sets movies both stills] [--movies 40] [--stills 300] [--jobs 2]
                              [--out out/stated]
 
 sets: the path-traced movies of SHARED_FOLDER, each camera alone and both together. The mean error of a movie is what
-lasts; the rest varies. Each is divided by its stated covariance: 1 is honest, above 1 the stated errors are too small.
+lasts; the rest varies. Each is divided by its stated covariance: 1 is right, above 1 the stated errors are too small.
 movies: synthetic movies of one camera with lamps, gloss, wear and blur drawn by the seed; both: of two cameras.
-stills: 1, 2, 4 and 8 frames of a synthetic ball, one camera. What was measured is kept in --out: a run that was cut off
-goes on. Half an hour on two cores.
+stills: 1, 2, 4 and 8 frames of a synthetic ball, one camera. Results are kept in --out: an interrupted run
+continues. Half an hour on two cores.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Stated:
-    """Errors of a track, and how they compare with what it states; squares are means over the three axes."""
+    """Errors of a track over its stated errors; squares are means over the three axes."""
 
     name: str
     frames: int  # valid, not in doubt
@@ -184,12 +184,12 @@ def squares(error: Floats, covariance: Floats) -> Floats:
 
 
 def root(values: Iterable[float]) -> str:
-    """Word the root mean square of squares."""
+    """Return the root of mean squares as text."""
     return f"{np.sqrt(np.nanmean(list(values))):.2f}"
 
 
 def of_sets(found: Sequence[Stated]) -> str:
-    """Word a table with a row for each movie."""
+    """Return a table with a row for each movie."""
     head = "| movie | valid | p50, degrees | varies, over sigma | lasts, over sigma | in the stated 95 % | "
     head += "position: varies | lasts |\n|" + "---|" * 8
     rows = [
@@ -201,7 +201,7 @@ def of_sets(found: Sequence[Stated]) -> str:
 
 
 def of_movies(found: Sequence[Stated], cameras: int) -> str:
-    """Word what all movies say together."""
+    """Return a table of all movies together."""
     good = [one for one in found if not one.refused and one.frames]
     parts = [[getattr(one, name) for one in good] for name in ("varying", "lasting", "place_varying", "place_lasting")]
     inside = 100 * float(np.mean(3 * np.array(parts[1]) < INSIDE))
@@ -213,7 +213,7 @@ def of_movies(found: Sequence[Stated], cameras: int) -> str:
 
 
 def of_counts(found: Sequence[Stated]) -> str:
-    """Word how many stills have their truth in the stated region."""
+    """Return a table of the stills with their truth in the stated region."""
     lines = ["", "| frames | stills measured | in the stated 95 % | p50, degrees | over sigma |\n|---|---|---|---|---|"]
     for count in STILLS:
         some = [one for one in found if one.name == str(count)]

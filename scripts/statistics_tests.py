@@ -4,8 +4,8 @@
 
 Prints how often the test of uniformity on SO(3) rejects at 5 %: independent uniform attitudes and tracks of uniform
 attitudes (its size), the same tracks with all frames taken as independent, and sets that are biased a little (its
-power); and in which frame an ensemble is said to prefer directions that does so in the lab, or in the body. Seven
-minutes.
+power). Then it prints the frame in which an ensemble is found to prefer directions, for ensembles that do so in the lab
+or in the body. Seven minutes.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def tracked(rng: np.random.Generator) -> Attitudes:
 
 
 def pretended(rng: np.random.Generator) -> Attitudes:
-    """Return the same with every frame taken as independent."""
+    """Return the same tracks with every frame taken as independent."""
     return tracked(rng)[0], None
 
 
@@ -68,14 +68,14 @@ CASES: dict[str, tuple[Callable[[np.random.Generator], Attitudes], str]] = {
 }
 
 
-def told_frames(frame: str, count: int) -> Counter[str]:
-    """Return how often an ensemble is told to prefer directions of which frame."""
+def seen_frames(frame: str, count: int) -> Counter[str]:
+    """Count the frames in which ensembles are found to prefer directions."""
     spec = EnsembleSpec(segments=200, mean_frames=90.0, frame="lab" if frame == "lab" else "body", omega_rms=UNEQUAL)
-    few, told = BootstrapSettings(resamples=100), Counter[str]()
+    few, seen = BootstrapSettings(resamples=100), Counter[str]()
     for seed in shown(range(count), f"prefers {frame}", transient=True):
         ensemble = ensemble_of(draw_ensemble(spec, seed))
-        told[anisotropic_frame(isotropy(ensemble, "omega_lab", few), isotropy(ensemble, "omega_body", few), 0.001)] += 1
-    return told
+        seen[anisotropic_frame(isotropy(ensemble, "omega_lab", few), isotropy(ensemble, "omega_body", few), 0.001)] += 1
+    return seen
 
 
 def main() -> None:
@@ -90,10 +90,10 @@ def main() -> None:
         rejected = [not uniformity(*draw(np.random.default_rng([seed, 1]))).uniform for seed in seeds]
         table.add_row(name, f"{100 * np.mean(rejected):.1f} %", wanted)
     Console().print(table)
-    table = Table("omega is unequal in", "told: lab", "body", "both", "neither", title="Frames, p below 0.001 counts")
+    table = Table("omega is unequal in", "found: lab", "body", "both", "neither", title="Frames, p below 0.001 counts")
     for frame in ("lab", "body"):
-        told = told_frames(frame, options.ensembles)
-        table.add_row(frame, *(str(told[name]) for name in ("lab", "body", "both", "neither")))
+        seen = seen_frames(frame, options.ensembles)
+        table.add_row(frame, *(str(seen[name]) for name in ("lab", "body", "both", "neither")))
     Console().print(table)
 
 

@@ -52,7 +52,7 @@ class DivisionCamera(CentralCamera):
 # %% [markdown]
 # ## Try it
 #
-# A point goes to a pixel, and the ray of that pixel back through the point.
+# A point is projected to a pixel, and the ray of that pixel passes through the point.
 
 # %%
 camera = DivisionCamera(
@@ -73,8 +73,8 @@ assert miss < 1e-9
 # %% [markdown]
 # ## Into files, calibration and tracking
 #
-# `add_model`, and `cameras.yaml` may say `model: division`. Calibration, walls (`port`), triangulation and
-# fits use `project` and `rays`, and know the parameters by their names.
+# After `add_model`, `cameras.yaml` may hold `model: division`. Calibration, walls (`port`), triangulation and
+# fits use `project` and `rays`, and find the parameters by their names.
 
 # %%
 add_model(DivisionCamera)

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # A fly on a ball, coming from FicTrac
 #
-# One camera, of which the field of view is known; a ball that turns in its place, of unknown texture. FicTrac's
-# `config.txt` is taken over, the texture map is learnt from the movie, and the walk is read off. The ball is
-# rendered, so that the truth is known.
+# One camera with a known field of view films a fixed ball of unknown texture. FicTrac's `config.txt` is imported,
+# the texture map is learnt from the movie, and the walk is computed. The ball is rendered, so that the truth is
+# known.
 
 # %%
 import subprocess
@@ -41,7 +41,7 @@ write_synthetic_experiment(folder, settings)
 # %% [markdown]
 # ## The configuration of FicTrac
 #
-# `vfov` is the field of view from top to bottom. `c2a_r` turns the camera's axes into the animal's: here they are the
+# `vfov` is the field of view from top to bottom. `c2a_r` rotates the camera's axes into the animal's: here they are the
 # same.
 
 # %%

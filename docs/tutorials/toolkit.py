@@ -46,7 +46,7 @@ for form in (picture, picture.double(), picture.numpy()):
     assert so3.geodesic_distance(best, R_true) < math.radians(3)
 
 # %% [markdown]
-# A disk without a candidate says why. Where no picture showed the paint (`load_unseen` reads that beside a learnt map),
+# A disk without a candidate has a reason. If no picture showed the paint (`load_unseen` reads that with a learnt map),
 # write NaN into the map: pixels that show it are not compared.
 
 # %%
@@ -82,7 +82,7 @@ assert fit.success
 assert off < 5 * sigma
 
 # %% [markdown]
-# A start that is too far away ends elsewhere: the fit says so, and states no error.
+# A start that is too far away ends elsewhere: the fit fails, with a reason.
 
 # %%
 lost = fitter(grey, so3.exp(torch.tensor([0.0, 1.5, 0.0], dtype=torch.float64)) @ R_true, truth)
@@ -103,7 +103,7 @@ print("slope by the rotation:", delta.grad)
 # %% [markdown]
 # ## Path
 #
-# Candidates in each frame; the physics of the motion chooses. Here the likelier one is wrong in every fifth frame.
+# Each frame has candidates; the path minimises changes of omega. Here the likelier one is wrong in every fifth frame.
 
 # %%
 frames, step = 40, 0.01

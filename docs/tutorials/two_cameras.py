@@ -2,7 +2,7 @@
 # # Two cameras: from a plate to a report
 #
 # A ball is filmed by two cameras. First the cameras are calibrated, then the ball is tracked, then a report is made.
-# Everything here is rendered, so that the truth is known; with your own movies the same commands do it.
+# Everything here is rendered, so that the truth is known; the same commands work for your movies.
 
 # %%
 from pathlib import Path
@@ -49,7 +49,7 @@ for name in calibrated.cameras:
 # %% [markdown]
 # ## Check, then track
 #
-# `check` looks at movies, cameras and texture map, and says what to do where they do not fit together.
+# `check` examines movies, cameras and texture map, and gives advice where they do not fit together.
 
 # %%
 checked = sphereorient.check(experiment)
@@ -71,7 +71,7 @@ figure
 # %% [markdown]
 # ## How good is it?
 #
-# The truth is known here: errors in degrees and mm, and how large the track says they are.
+# The truth is known here: errors in degrees and mm, and those that the track states.
 
 # %%
 from sphereorient.bench import score_track
