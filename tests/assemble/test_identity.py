@@ -63,7 +63,7 @@ def test_balls_that_meet_while_nobody_sees_them_are_said_to_be_in_doubt():
     X, R = motions(1)
     apart = np.where(TIME_S < 0.1, 20 * (0.1 - TIME_S), 20 * (TIME_S - 0.1))[:, None] * np.array([1.0, 0, 0])
     X = np.concatenate([X - apart, X + apart])
-    R = np.concatenate([R, R])  # nor do their rotations tell
+    R = np.concatenate([R, R])  # nor do their rotations differ
     seen = np.ones((2, FRAMES), bool)
     seen[:, 40:80] = False
     _, sure = same_balls(X, R, seen, TIME_S, [])

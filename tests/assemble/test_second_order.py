@@ -93,7 +93,7 @@ def test_thirty_per_cent_of_the_frames_may_be_missing(deg_per_frame, rng):
     assert lost_frames(path) == missing
     assert wrong_frames(path, R) == []
     assert set(path.segment.tolist()) <= {-1, 0}
-    rows = torch.nonzero(path.present).flatten()  # frames that were never written: the same, told by the times alone
+    rows = torch.nonzero(path.present).flatten()  # frames that were never written: the same, by the times alone
     dropped = physical_path(pooled(path.R_lab_body[rows]), times(300)[rows], SETTINGS)
     assert_close(dropped.turn_rad, path.turn_rad[rows])
     assert dropped.segment.unique().tolist() == [0]
@@ -209,9 +209,9 @@ def test_twins_that_turn_alike_are_flagged_with_even_odds(deg_per_frame, rng):
     assert len(path.choice.unique()) == 1
     assert flagged(path, Flag.AMBIGUOUS) == list(range(150))
     assert_close(path.posterior, torch.full_like(path.posterior, 0.5), 0.2)
-    told = torch.zeros(150, 2, dtype=torch.float64)
-    told[:, 0] = 0.2  # a little in every frame: over the movie it decides
-    assert physical_path(pooled(R, twin, nll=told), times(150), SETTINGS).choice.unique().tolist() == [1]
+    costs = torch.zeros(150, 2, dtype=torch.float64)
+    costs[:, 0] = 0.2  # a little in every frame: over the movie it decides
+    assert physical_path(pooled(R, twin, nll=costs), times(150), SETTINGS).choice.unique().tolist() == [1]
 
 
 def test_pictures_decide_where_motion_cannot():

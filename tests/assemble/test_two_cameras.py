@@ -156,7 +156,7 @@ def test_where_both_lack_the_truth_and_contradict_each_other_the_result_is_wrong
     assert track.R_lab_body_of[wrong][list(STRETCH)].isnan().all()
 
 
-def test_where_both_are_wrong_alike_only_the_spikes_tell():
+def test_where_both_cameras_are_wrong_alike_only_spikes_show_it():
     """A known weakness: cameras that agree are believed."""
     R = turning(60)
     false = sees(R, false_in=STRETCH, true_in=())

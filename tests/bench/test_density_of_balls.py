@@ -213,10 +213,10 @@ def test_the_command_writes_table_and_figure_and_prints_a_row_for_each_point(tmp
         return curve()
 
     monkeypatch.setattr("sphereorient.bench.run_benchmarks", planned)
-    code, told, _ = command(monkeypatch, capsys, "bench", "balls", "--out", tmp_path / "run", "--balls", "1,4")
+    code, printed, _ = command(monkeypatch, capsys, "bench", "balls", "--out", tmp_path / "run", "--balls", "1,4")
     assert code == 0
-    assert "density.png" in told
-    assert len([line for line in told.splitlines() if "2.6" in line or "10.5" in line]) == 4
+    assert "density.png" in printed
+    assert len([line for line in printed.splitlines() if "2.6" in line or "10.5" in line]) == 4
     assert {name: (plan.balls, plan.cameras, plan.paints, plan.volume_mm) for name, plan in asked.items()} == {
         "1-balls-2-cameras": (1, 2, 2, 45.0),
         "4-balls-2-cameras": (4, 2, 2, 45.0),

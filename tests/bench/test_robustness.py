@@ -291,9 +291,9 @@ def test_a_file_says_which_scenes_and_an_option_wins(tmp_path, monkeypatch, caps
 def test_compare_as_a_command(tmp_path, monkeypatch, capsys):
     save_results(results(outcome()), tmp_path / "old.json")
     save_results(results(outcome(orientation_deg=(0.2,) * FRAMES)), tmp_path / "new.json")
-    code, told, _ = command(monkeypatch, capsys, "bench", "compare", tmp_path / "new.json", tmp_path / "old.json")
+    code, printed, _ = command(monkeypatch, capsys, "bench", "compare", tmp_path / "new.json", tmp_path / "old.json")
     assert code == 1
-    assert "worse: defocus 1, precise: median error, degrees 0.02 -> 0.2" in told
+    assert "worse: defocus 1, precise: median error, degrees 0.02 -> 0.2" in printed
     assert command(monkeypatch, capsys, "bench", "compare", tmp_path / "old.json", tmp_path / "old.json")[0] == 0
 
 

@@ -101,7 +101,7 @@ CHARUCO = CharucoBoard(columns=8, rows=6, pitch_mm=10.0, marker_mm=7.0)
 
 @pytest.mark.parametrize(("corners", "least"), [(CORNERS, 35), (PARTLY, 20)])
 @pytest.mark.parametrize("turn", [0, 2])
-def test_a_charuco_board_is_told_from_a_part_of_it_and_from_any_side(
+def test_a_charuco_board_is_recognised_by_a_part_of_it_and_from_any_side(
     corners: list[list[int]], least: int, turn: int
 ) -> None:
     picture, homography = seen(charuco_drawing(CHARUCO), corners)

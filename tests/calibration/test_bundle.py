@@ -102,7 +102,7 @@ def test_covariances_cover_the_errors_of_200_calibrations(rng):
 
 
 @pytest.mark.slow
-def test_the_residuals_tell_the_scale_of_the_covariance_not_the_sigmas_given(rng):
+def test_the_residuals_give_the_scale_of_the_covariance_not_the_sigmas_given(rng):
     rig = planted(rng, count=4)
     seen = views(rig, rng)
     triple = {

@@ -48,10 +48,10 @@ def seen_by(
 def reported(seen: Seen, cameras: dict[str, Camera]) -> Seen:
     """Return the same pictures as fits with other cameras read them: the view of the sphere stays."""
     R = torch.empty_like(seen.R_lab_body)
-    for k, (true, told) in enumerate(zip(seen.cameras.values(), cameras.values(), strict=True)):
+    for k, (true, given) in enumerate(zip(seen.cameras.values(), cameras.values(), strict=True)):
         view = [
             c.R_cam_lab.mT @ R_cam_view(c.rays(seen.centre_px[:, k]).direction_lab @ c.R_cam_lab.mT)
-            for c in (true, told)
+            for c in (true, given)
         ]
         R[:, k] = view[1] @ view[0].mT @ seen.R_lab_body[:, k]
     return replace(seen, cameras=cameras, R_lab_body=R)
@@ -106,7 +106,7 @@ def test_a_moved_camera_is_named():
     moved = replace(one, T_cam_lab_mm=one.T_cam_lab_mm + torch.tensor([4.0, 0.0, 0.0]))
     found = compare_cameras(reported(seen_by(CAMERAS), CAMERAS | {"cam2": moved}), LIMITS)
     assert found.contradicts
-    assert "cam2 rotated by 0.4" in found.advice  # 4 mm at 520 mm: this noise does not tell one from the other
+    assert "cam2 rotated by 0.4" in found.advice  # 4 mm at 520 mm: this noise does not distinguish the two
 
 
 def test_swapped_movies_are_deadly():
@@ -142,7 +142,7 @@ def test_wide_pixels_are_named(share):
     assert f"pixels of cam1 and cam2 {100 * share:+.1f} % wider" in found.advice
 
 
-def test_outlines_that_are_wider_than_high_tell_wide_pixels_from_a_wrong_diameter():
+def test_outlines_that_are_wider_than_high_show_wide_pixels_and_no_wrong_diameter():
     """A ball in the middle of the picture: its size alone fits either."""
     seen = seen_by(CAMERAS, diameter_mm=0.985 * MM)
     round_, wide = torch.zeros_like(seen.radius_px), torch.full_like(seen.radius_px, -0.03)

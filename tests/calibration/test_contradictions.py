@@ -218,7 +218,7 @@ def test_of_three_cameras_in_use_one_that_is_off_moves_the_mean_by_a_third():
     marked, _ = with_contradictions(track_of({"cam3": 1.0}, {}, of=THREE), THREE, MM, True)
     assert (marked.flags == Flag.CONTRADICTION).all()
     sigma = np.degrees(np.sqrt(marked.orientation_cov[:, 0, 0]))
-    # Two pairs tell of it.
+    # Two pairs show it.
     np.testing.assert_allclose(sigma, math.hypot(math.sqrt(2) / 3, math.degrees(SIGMA_RAD) / math.sqrt(2)), rtol=1e-6)
 
 

@@ -24,7 +24,7 @@ from sphereorient.report import calibration_figure
 
 PORT = {"offset": 100.0, "thickness": 12.0, "n_glass": 1.49, "n_fluid": 1.36}
 
-# Where the fiducials are, and where they would be half a turn on: without these nobody can tell the two apart.
+# Where the fiducials are, and where they would be half a turn on: without these the two look alike.
 HIDDEN = ((0, 0), (3, 0), (0, 2), (-3, 0), (0, -2))
 
 

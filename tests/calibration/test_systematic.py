@@ -98,9 +98,9 @@ def test_covariances_are_those_of_brute_force(walls, rng):
     place = torch.tensor([12.0, -20.0, 25.0], dtype=torch.float64)
     ball = Ball(rig, place)
     errors = torch.stack([ball.error(wrong_cameras(rig, known, draw)) for draw in draws(known, 80, rng)])
-    told = systematic_errors(rig, known, place[None], RADIUS)
-    for part, block in ((told[1][0], errors[:, :3]), (told[0][0], errors[:, 3:])):
-        # Whitened by what is told, the errors have unit size in every direction.
+    computed = systematic_errors(rig, known, place[None], RADIUS)
+    for part, block in ((computed[1][0], errors[:, :3]), (computed[0][0], errors[:, 3:])):
+        # Whitened by the computed covariance, the errors have unit size in every direction.
         white = torch.linalg.solve_triangular(torch.linalg.cholesky(part), block.mT, upper=False)
         assert torch.allclose(white.square().mean(1).sqrt(), torch.ones(3).double(), atol=0.3)
         assert abs(float(white.square().mean().sqrt()) - 1) < 0.2
@@ -120,27 +120,27 @@ def test_a_turn_of_both_cameras_turns_the_ball_and_its_place(rng):
     sigma = 1e-3
     known = ParameterCovariance(names=tuple(names), matrix=sigma**2 * torch.outer(direction, direction))
     place = torch.tensor([0.0, 30.0, 0.0], dtype=torch.float64)
-    told = systematic_errors(rig, known, place[None], RADIUS)
+    computed = systematic_errors(rig, known, place[None], RADIUS)
     expected_turn, expected_move = torch.zeros(3, 3).double(), torch.zeros(3, 3).double()
     expected_turn[0, 0] = sigma**2
     expected_move[2, 2] = (sigma * 30.0) ** 2  # turned about x, y = 30 goes along z
-    assert_close(told[1][0], expected_turn, atol=1e-10)
-    assert_close(told[0][0], expected_move, atol=1e-8)
+    assert_close(computed[1][0], expected_turn, atol=1e-10)
+    assert_close(computed[0][0], expected_move, atol=1e-8)
 
 
-def test_between_the_frames_that_are_computed_a_quadratic_tells_the_same(rng):
+def test_between_the_frames_that_are_computed_a_quadratic_gives_the_same(rng):
     """Of many frames some are computed; of as few as here all."""
     rig, known = cameras(), covariance(rng)
     places = 40 * (2 * torch.rand(400, 3, generator=rng, dtype=torch.float64) - 1)
     direct = systematic_errors(rig, known, places[:100], RADIUS)
     quick = [errors[:100] for errors in systematic_errors(rig, known, places, RADIUS)]
     for both in zip(direct, quick, strict=True):
-        sigmas = [told.diagonal(dim1=-2, dim2=-1).sqrt() for told in both]
+        sigmas = [computed.diagonal(dim1=-2, dim2=-1).sqrt() for computed in both]
         assert float(((sigmas[1] - sigmas[0]).norm(dim=-1) / sigmas[0].norm(dim=-1)).max()) < 0.02
 
 
-def test_frames_that_stand_still_are_told_as_well(rng):
-    """A quadratic through one place only is not determined: it must still tell what was computed there."""
+def test_frames_without_motion_have_systematic_errors_as_well(rng):
+    """A quadratic through one place only is not determined: it must still give what was computed there."""
     rig, known = cameras(), covariance(rng)
     places = torch.tensor([[5.0, 1.0, -3.0]], dtype=torch.float64).expand(400, 3) + 1e-9 * torch.randn(400, 3).double()
     direct = systematic_errors(rig, known, places[:1], RADIUS)
@@ -151,11 +151,11 @@ def test_frames_that_stand_still_are_told_as_well(rng):
 def test_frames_without_a_position_have_no_systematic_error(rng):
     rig, known = cameras(), covariance(rng)
     places = torch.tensor([[0.0, 0, 0], [torch.nan, 0, 0], [1.0, 2, 3]], dtype=torch.float64)
-    told = systematic_errors(rig, known, places, RADIUS)
-    assert torch.isnan(told[0][1]).all()
-    assert torch.isfinite(told[0][[0, 2]]).all()
+    computed = systematic_errors(rig, known, places, RADIUS)
+    assert torch.isnan(computed[0][1]).all()
+    assert torch.isfinite(computed[0][[0, 2]]).all()
     alone = systematic_errors(rig, known, places[2:], RADIUS)
-    assert_close(told[1][2], alone[1][0])
+    assert_close(computed[1][2], alone[1][0])
     empty = systematic_errors(rig, known, places[:0], RADIUS)
     assert empty[0].shape == (0, 3, 3)
 
@@ -164,5 +164,5 @@ def test_what_is_exact_in_all_cameras_leaves_nothing(rng):
     rig = cameras()
     known = covariance(rng)
     exact = ParameterCovariance(names=known.names, matrix=0 * known.matrix)
-    told = systematic_errors(rig, exact, torch.zeros(1, 3, dtype=torch.float64), RADIUS)
-    assert_close(told[0], torch.zeros(1, 3, 3).double())
+    computed = systematic_errors(rig, exact, torch.zeros(1, 3, dtype=torch.float64), RADIUS)
+    assert_close(computed[0], torch.zeros(1, 3, 3).double())

@@ -80,7 +80,7 @@ def test_dropped_points_are_counted_and_with_structure_over_the_noise_nothing_is
     assert doubts(fitted(noise(), used)) == {}  # a single outlier
 
 
-def test_centre_and_focal_length_beyond_belief_are_told():
+def test_centre_and_focal_length_beyond_belief_are_reported():
     (words,) = doubts(fitted(noise(), centre_px=torch.tensor([391.5, 289.5], dtype=torch.float64)))["cam1"].words
     assert "76 px off" in words
     (words,) = doubts(fitted(noise(), f_mm=torch.tensor(2000.0, dtype=torch.float64)))["cam1"].words
@@ -106,7 +106,7 @@ def rig_and_views(walls, seed=3, model="tsai"):
 
 
 @pytest.mark.slow
-def test_a_plate_behind_a_wall_that_nobody_described_is_told_with_its_cause(monkeypatch):
+def test_a_plate_behind_an_undescribed_wall_is_reported_with_its_cause(monkeypatch):
     """Before: f 48.4 for 35, centre 169 px off, without a message. After: structure of 0.07 px, and its wall."""
     rig, seen = rig_and_views(walls=True)
     *words, cause = calibrated(monkeypatch, seen, document(rig)).verdict
@@ -127,7 +127,7 @@ def test_a_right_calibration_has_no_verdict(monkeypatch, walls):
 
 
 @pytest.mark.slow
-def test_a_lens_of_another_model_is_told(monkeypatch):
+def test_a_lens_of_another_model_is_reported(monkeypatch):
     rig, seen = rig_and_views(walls=False, model="brown")
     *_, cause = calibrated(monkeypatch, seen, document(rig, model="pinhole")).verdict
     assert "is explained by `model: brown` (rms 0.04" in cause

@@ -146,7 +146,7 @@ def test_a_track_of_other_cameras_or_of_one_is_refused(tmp_path):
         refine_with_track(tmp_path / "cameras.yaml", tmp_path / "one.h5")
 
 
-def test_check_cameras_tells_gaps_of_lines_of_sight_in_mm_and_px():
+def test_check_cameras_prints_gaps_of_lines_of_sight_in_mm_and_px():
     calibrated = cameras()
     (right,) = check_cameras(calibrated, track_of(calibrated, calibrated))
     (wrong,) = check_cameras(calibrated, track_of(calibrated, bumped(calibrated)))
@@ -159,7 +159,7 @@ def test_check_cameras_tells_gaps_of_lines_of_sight_in_mm_and_px():
     assert "px" in line
 
 
-def test_only_frames_in_which_both_cameras_tell_are_counted():
+def test_only_frames_that_both_cameras_measured_are_counted():
     calibrated = cameras()
     track = track_of(calibrated, calibrated)
     reason = ("not_found",) * 50 + track.cameras["cam1"].reason[50:]
@@ -168,12 +168,12 @@ def test_only_frames_in_which_both_cameras_tell_are_counted():
     assert len(check.gap_mm) == FRAMES - 50
 
 
-@pytest.mark.parametrize(("contradicts", "told"), [(0, False), (20, False), (100, True)])
-def test_cameras_that_contradict_each_other_most_of_the_time_are_told_of(contradicts, told):
+@pytest.mark.parametrize(("contradicts", "reported"), [(0, False), (20, False), (100, True)])
+def test_cameras_that_contradict_each_other_most_of_the_time_are_reported(contradicts, reported):
     calibrated = cameras()
     lines = contradiction_lines(track_of(calibrated, calibrated, contradicts))
-    assert bool(lines) is told
-    if told:
+    assert bool(lines) is reported
+    if reported:
         assert f"in {contradicts} of the {FRAMES} frames" in lines[0]
         assert "--refine-with" in lines[1]
 

@@ -196,8 +196,8 @@ def test_the_gain_against_truth_another_track_and_fictracs_table_is_that_of_the_
     assert not of_fictrac["exact"]
     assert of_fictrac["pairs"] == 197  # frame 50 is not in it
     assert of_fictrac["gain"]["value"][:3] == pytest.approx([1.0, 0.97, 1.0], abs=2e-3)
-    told = CliRunner().invoke(app, ["score", str(tmp_path / "track.h5"), str(tmp_path / "theirs.dat")]).output
-    assert "--align both" in told
+    printed = CliRunner().invoke(app, ["score", str(tmp_path / "track.h5"), str(tmp_path / "theirs.dat")]).output
+    assert "--align both" in printed
     moving = replace(on_a_ball, position=np.arange(600.0).reshape(200, 3))  # by its own positions only
     moving.save(tmp_path / "moving.h5")
     assert scored(tmp_path / "moving.h5", tmp_path / "truth.h5")["length_ratio"] == pytest.approx(0.97, abs=0.02)
@@ -229,15 +229,15 @@ def test_a_table_whose_counter_begins_anew_is_cut_there(on_a_ball, tmp_path):
 
 
 def test_behaviour_is_printed_and_a_short_track_says_why_not(on_a_ball, tmp_path):
-    told = CliRunner().invoke(app, ["score", str(tmp_path / "track.h5"), str(tmp_path / "truth.h5")]).output
-    assert "0.9700" in told
-    assert all(word in told for word in ("gain, smoothed", "drift (degrees a minute)", "ratio of path lengths"))
-    told = (
+    printed = CliRunner().invoke(app, ["score", str(tmp_path / "track.h5"), str(tmp_path / "truth.h5")]).output
+    assert "0.9700" in printed
+    assert all(word in printed for word in ("gain, smoothed", "drift (degrees a minute)", "ratio of path lengths"))
+    printed = (
         CliRunner()
         .invoke(app, ["score", str(tmp_path / "theirs.dat"), str(tmp_path / "truth.h5"), "--align", "both"])
         .output
     )
-    assert "1.0000 .. 1.0000" in told
+    assert "1.0000 .. 1.0000" in printed
     on_a_ball[:40].save(tmp_path / "short.h5")
     short = scored(tmp_path / "short.h5", tmp_path / "truth.h5")
     assert short["gain"]["value"] == [None] * 4

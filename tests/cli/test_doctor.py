@@ -39,13 +39,13 @@ def command(monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", ["sphereorient", *words])
         with pytest.raises(SystemExit) as stopped:
             main()
-        told = capsys.readouterr()
-        return int(stopped.value.code or 0), told.out, told.err.splitlines()
+        printed = capsys.readouterr()
+        return int(stopped.value.code or 0), printed.out, printed.err.splitlines()
 
     return run
 
 
-def test_a_machine_in_order_is_told_as_one_object(command):
+def test_a_machine_in_order_is_printed_as_one_object(command):
     code, said, errors = command("doctor", "--json")
     found = json.loads(said)
     assert (code, errors, found["broken"]) == (0, [], [])
@@ -84,7 +84,7 @@ def test_a_frame_without_a_pose_is_broken(monkeypatch, command):
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("no kernel")], ids=str)
-def test_a_fit_that_cannot_be_tried_is_broken_and_the_rest_is_told(monkeypatch, command, error):
+def test_a_fit_that_cannot_be_tried_is_broken_and_the_rest_is_reported(monkeypatch, command, error):
     def fails(px: float) -> dict[str, float]:
         raise error
 
@@ -133,7 +133,7 @@ def test_a_package_that_is_missing_or_does_not_load_is_one_line(monkeypatch, com
     missing, damaged = found["broken"]
     assert missing.startswith("av: expected >=")
     assert damaged.startswith("h5py: ")
-    assert "pyzmq" in found["not_installed"]["live"], "an extra is told, but breaks nothing"
+    assert "pyzmq" in found["not_installed"]["live"], "an extra is reported, but breaks nothing"
 
 
 @pytest.mark.slow

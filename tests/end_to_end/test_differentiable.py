@@ -53,8 +53,8 @@ class Scene:
     position_lab_mm: Tensor  # (N, 3)
 
     def sight(self, change: Tensor) -> Rays:
-        told = (self.cameras[0], with_parameters(self.cameras[1], NAMES, change))
-        both = [camera.rays(self.uv_px) for camera in told]
+        given = (self.cameras[0], with_parameters(self.cameras[1], NAMES, change))
+        both = [camera.rays(self.uv_px) for camera in given]
         origin, direction = ([getattr(rays, part) for rays in both] for part in ("origin_lab_mm", "direction_lab"))
         return Rays(origin_lab_mm=torch.stack(origin), direction_lab=torch.stack(direction))
 
@@ -135,7 +135,7 @@ def gradients(scene: Scene, iterations: int = 20) -> tuple[Tensor, Tensor]:
     return both.detach(), torch.stack(rows)
 
 
-THETA = (0.01, 2.0, 0.2)  # rad, px, paint: told wrong, so that residuals are left
+THETA = (0.01, 2.0, 0.2)  # rad, px, paint: given wrong, so that residuals are left
 STEPS = (1e-5, 1e-2, 1e-4)  # of the differences; the third order they leave out is below 1e-6
 
 

@@ -1,4 +1,4 @@
-"""Figures of the docs: each page with numbers is named, tables go where they belong, and older ones are told."""
+"""Figures of the docs: each page with numbers is named, tables go where they belong, and older ones are reported."""
 
 from __future__ import annotations
 

@@ -329,15 +329,15 @@ def test_pictures_out_of_focus_by_a_seventh_of_the_radius_are_tracked(brisk, tmp
 
 
 @pytest.mark.slow
-def test_the_blur_of_soft_pictures_is_learnt_as_well_as_told_and_a_told_one_is_used(brisk, tmp_path):
+def test_the_blur_of_soft_pictures_is_learnt_and_a_given_one_is_used(brisk, tmp_path):
     movies = soft(brisk, 0.95)
-    told = [() if blur is None else (f"refine.blur_px={blur}",) for blur in (None, 1.13, 0.625)]
-    folders = [tmp_path / str(k) for k in range(len(told))]
+    options = [() if blur is None else (f"refine.blur_px={blur}",) for blur in (None, 1.13, 0.625)]
+    folders = [tmp_path / str(k) for k in range(len(options))]
     for folder in folders:
         folder.mkdir()
-    found = [tracked(movies, folder, *given) for folder, given in zip(folders, told, strict=True)]
+    found = [tracked(movies, folder, *given) for folder, given in zip(folders, options, strict=True)]
     learnt, right, wrong = (np.median(turned_off(track, movies)) for track in found)
-    print(f"learnt {learnt:.4f}, told {right:.4f}, told wrongly {wrong:.4f} degrees")
+    print(f"learnt {learnt:.4f}, given {right:.4f}, given wrongly {wrong:.4f} degrees")
     assert learnt < 1.15 * right
     assert wrong > 1.5 * right
     assert 0.6 < rms(in_sigmas(rotation_error(found[0], movies), found[0].orientation_cov)) < 1.4
@@ -456,8 +456,8 @@ def test_what_a_block_measures_does_not_depend_on_the_blocks_beside_it(short, tm
     def poses_of(*blocks: int) -> list[str]:
         """Follow blocks, by number, in one window."""
         rows = np.concatenate([np.arange(16 * block, 16 * block + 16) for block in blocks])
-        shots = [[Frame(shown=picture) for picture in movie[rows]] for movie in pictures]
-        return [_digest(row[""]) for row in tracker.track(shots, [16] * len(blocks), (rows / 600.0).tolist())]
+        frames = [[Frame(shown=picture) for picture in movie[rows]] for movie in pictures]
+        return [_digest(row[""]) for row in tracker.track(frames, [16] * len(blocks), (rows / 600.0).tolist())]
 
     each = [poses_of(block) for block in range(3)]
     assert [poses_of(block) for block in (2, 0, 1)] == [each[2], each[0], each[1]]

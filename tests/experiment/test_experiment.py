@@ -183,7 +183,7 @@ def test_the_shared_experiments_open(name, count):
     assert experiment.fixed == (name == "fixed_ball")
 
 
-def test_files_outside_of_the_experiments_folder_are_told(folder, tmp_path_factory):
+def test_files_outside_of_the_experiments_folder_are_reported(folder, tmp_path_factory):
     assert outside_paths(load_experiment(written(folder, FULL))) == []
     other = tmp_path_factory.mktemp("other") / "texture.png"
     (folder / "link.png").symlink_to(other)

@@ -104,7 +104,7 @@ def test_a_table_that_is_none_is_refused(folder, name):
 
 
 def test_stamps_pair_the_cameras_whatever_either_lost(folder):
-    """cam1 lost picture 3, cam2 lost pictures 1 and 5, and is 0.2 ms late: stamps tell, counting would not."""
+    """cam1 lost picture 3, cam2 lost pictures 1 and 5, and is 0.2 ms late: stamps show it, counting would not."""
     grid = np.arange(8) * 0.01
     save_stamped(folder / "cam1.h5", np.delete(grid, 3).tolist())
     save_stamped(folder / "films" / "cam2.h5", (np.delete(grid, [1, 5]) + 0.0002).tolist())
@@ -129,7 +129,7 @@ def test_with_start_each_cameras_clock_begins_at_that_picture(folder):
     np.testing.assert_allclose(frames.time_s, 0.01 * np.arange(7), atol=1e-12)
 
 
-def test_cameras_that_are_late_on_each_other_are_told(folder):
+def test_cameras_that_are_late_on_each_other_are_reported(folder):
     grid = np.arange(8) * 0.01
     save_stamped(folder / "cam1.h5", grid.tolist())
     save_stamped(folder / "films" / "cam2.h5", (grid + 0.002).tolist())

@@ -64,14 +64,14 @@ def test_frames_that_are_far_off_hardly_move_the_mean_place():
     assert ((plain - good).abs() > 4 * sigma).any(), "a mean that believes all is carried away"
 
 
-def test_measurements_that_scatter_by_more_than_they_say_tell_less():
+def test_measurements_that_scatter_by_more_than_they_state_weigh_less():
     X, covariance = scattered(trials=1, count=12)
     _, said = mean_place(X[0], covariance)
     _, wider = mean_place(5 * X[0], covariance)
     assert float(wider.diagonal().sum() / said.diagonal().sum()) > 5
 
 
-def test_a_single_frame_tells_the_place_as_well_as_it_can():
+def test_a_single_frame_gives_the_position_with_its_own_error():
     X, covariance = scattered(trials=1, count=1)
     place, C = mean_place(X[0], covariance)
     assert_close(place, X[0, 0], 1e-9)
@@ -115,10 +115,10 @@ def truth(path: Path) -> tuple[Tensor, Tensor]:
         return torch.from_numpy(file["position"][()]), torch.from_numpy(file["orientation"][()])
 
 
-def beside(fitter: Fitter, shots: Sequence[Frame], pose: Poses, place: FixedCentre, error_mm: Tensor) -> Tensor:
+def beside(fitter: Fitter, frames: Sequence[Frame], pose: Poses, place: FixedCentre, error_mm: Tensor) -> Tensor:
     """Delta by which a frame's attitude is found to differ where the ball is held beside its place; brute force."""
     fine, use = fitter.optics.fine, pose.use[None]
-    pixels = fitter.pixels([[shot.picture for shot in shots]], place.position_lab_mm[None], fine)
+    pixels = fitter.pixels([[frame.picture for frame in frames]], place.position_lab_mm[None], fine)
     firm = 1e14 * torch.eye(3, dtype=torch.float64)[None]
     R = [
         fitter.fit(pixels, PoseStart(X[None], pose.R_lab_body[:1], use, firm), fine, 6).R_lab_body
@@ -130,7 +130,7 @@ def beside(fitter: Fitter, shots: Sequence[Frame], pose: Poses, place: FixedCent
 def followed_poses(
     path: Path, cameras: list[str] | None
 ) -> tuple[FixedCentre, list[Poses], list[Poses], Tensor, Tensor]:
-    """The place that a few frames tell, all frames' poses with each its own place, and held in that one.
+    """Position from a few frames; poses of all frames with a position each; poses at that one position.
 
     And two errors of the place, (2, 3), mm, with the turns that they do to some frames, (frames, 2, 3).
     """
@@ -139,8 +139,8 @@ def followed_poses(
         begun = learn(Job(recording=recording, settings=settings, device=torch.device("cpu")), silent)
         known, search = begun.appearance, begun.tracker.balls[""].search
         views = known.fitter.views
-        shots, _ = sample_frames(recording, views, settings.refine.appearance_frames)
-        place = find_fixed_centre(search, shots, known.score_min)
+        frames, _ = sample_frames(recording, views, settings.refine.appearance_frames)
+        place = find_fixed_centre(search, frames, known.score_min)
         assert place is not None
         movies = [
             list(screened_frames(stream, view.background))

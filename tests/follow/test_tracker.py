@@ -116,10 +116,10 @@ def test_after_a_pause_the_rate_goes_on_roughly():
 def test_a_late_time_stamp_does_not_bend_the_motion(late):
     stamps = [0.0, 1.0, 2.0, 3.0]
     stamps[late] = late + 0.99
-    told_late = Chunk(0, stamps)
+    appended_late = Chunk(0, stamps)
     for frame in range(3):
-        told_late.saw(frame, seen(frame, 0.0), 0.04 * AXIS.numpy())
-    expected = told_late.expected(3, RADIUS_MM)
+        appended_late.saw(frame, seen(frame, 0.0), 0.04 * AXIS.numpy())
+    expected = appended_late.expected(3, RADIUS_MM)
     assert not expected.rough
     assert_close(f64(expected.turn), 0.04 * AXIS, 1e-9)
     assert_close(f64(expected.position_lab_mm), place(3.0, 0.0), 1e-9)

@@ -352,7 +352,7 @@ def timed_hdf5(folder: Path, frames: Frames) -> Path:
 
 
 def watch(path: Path) -> None:
-    """Open a movie, and read from its beginning and its end: what is not decodable must be told frame by frame."""
+    """Open a movie, read from its beginning and its end: each undecodable frame must be refused by itself."""
     with open_movie(path) as movie:
         count = len(movie)
         assert count > 0

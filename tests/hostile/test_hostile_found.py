@@ -232,7 +232,7 @@ def test_a_picture_that_claims_too_much_is_refused_before_room_is_made(tmp_path,
         load_background(written(tmp_path / "empty.png", content), (16, 32))
 
 
-def test_formats_whose_size_is_not_told_before_decoding_are_refused(tmp_path):
+def test_formats_whose_size_is_not_known_before_decoding_are_refused(tmp_path):
     with pytest.raises(TextureError, match="PNG, TIFF or JPEG"):
         load_texture(written(tmp_path / "texture.png", encoded(".webp", np.dstack([pattern()] * 3))))
 

@@ -103,11 +103,11 @@ def test_what_was_cut_off_goes_on_to_the_same_weights(short, tmp_path, cut):
     with pytest.raises(KeyboardInterrupt):
         train_proposer(tiny(**SHORT), tmp_path, progress=interrupt)
     assert not (tmp_path / "proposer.ckpt").exists()
-    told: list[tuple[str, int]] = []
+    calls: list[tuple[str, int]] = []
     resumed = train_proposer(
-        tiny(**SHORT), tmp_path, resume=True, progress=lambda stage, done, total: told.append((stage, done))
+        tiny(**SHORT), tmp_path, resume=True, progress=lambda stage, done, total: calls.append((stage, done))
     )
-    steps = [done for stage, done in told if stage == "train"]
+    steps = [done for stage, done in calls if stage == "train"]
     assert steps[0] == cut - (cut - 1) % 4  # the epoch that was cut off begins again
     assert same(resumed.checkpoint, short[0].checkpoint)
     assert resumed.checkpoint.temperature == short[0].checkpoint.temperature

@@ -1,4 +1,4 @@
-"""Modules that stand for harvesters, pypylon and vmbpy, with cameras that misbehave as they are told to."""
+"""Modules that stand for harvesters, pypylon and vmbpy, with cameras that misbehave on request."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from sphereorient.follow.ball import BallTracker
 from sphereorient.live.sources import movie_frames
 
 
-def test_frames_one_by_one_are_as_good_as_a_whole_run_and_a_black_out_is_told(tmp_path_factory):
+def test_frames_one_by_one_are_as_good_as_a_whole_run_and_a_black_out_is_reported(tmp_path_factory):
     hidden = range(15, 19)
     with excerpt_opened(tmp_path_factory) as opened:
         frames = [
@@ -41,7 +41,7 @@ def test_frames_one_by_one_are_as_good_as_a_whole_run_and_a_black_out_is_told(tm
             assert now.error_rad < math.radians(0.2)
 
 
-def test_a_jump_is_found_and_told(tmp_path_factory):
+def test_a_jump_is_found_and_reported(tmp_path_factory):
     """From one frame to the next the ball turns by some tens of degrees, forty times as fast as before."""
     order = [*range(12), *range(39, 29, -1)]
     truth = torch.from_numpy(true_track().orientation)
@@ -60,7 +60,7 @@ def test_a_jump_wants_no_long_search_and_a_hidden_ball_one_a_second(monkeypatch,
     """The ball turns by some tens of degrees at once; later something grey without any paint is before it."""
     asked: list[int] = []
     long_search = BallTracker.searched
-    monkeypatch.setattr(BallTracker, "searched", lambda self, shots: asked.append(1) or long_search(self, shots))
+    monkeypatch.setattr(BallTracker, "searched", lambda self, frames: asked.append(1) or long_search(self, frames))
     order, hidden = [*range(8), *range(39, 30, -1)], range(12, 15)
     with excerpt_opened(tmp_path_factory) as opened:
         frames = list(movie_frames(opened.recording, paced=False))

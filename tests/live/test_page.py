@@ -46,7 +46,7 @@ def arrivals(recording) -> list[Arrival]:
 
 
 def poses():
-    """The excerpt's truth, told as if it were measured; frames 7 and 8 have none."""
+    """The excerpt's truth, as if it were measured; frames 7 and 8 have none."""
     track = true_track()
     orientation, position = track.orientation.copy(), track.position.copy()
     orientation[7:9] = np.nan
@@ -61,21 +61,21 @@ class Shown:
 
     page: LivePage
     running: Event
-    told: list[str]
+    messages: list[str]
 
 
 @contextmanager
 def shown(recording, arrivals: list[Arrival], folder: Path, count: int, save_map=None) -> Iterator[Shown]:
     ours, theirs = Pipe()
-    running, told = Event(), []
+    running, messages = Event(), []
     running.set()
-    writer = PageWriter(folder, ours, told.append)
+    writer = PageWriter(folder, ours, messages.append)
     writer.begin(recording, running, save_map)
     for arrival, now, _ in zip(arrivals, poses(), range(count), strict=False):
         writer.saw(arrival, now)
     page = LivePage(recording, folder, theirs)
     Thread(target=page.follow, daemon=True).start()
-    yield Shown(page, running, told)
+    yield Shown(page, running, messages)
     writer.close()
 
 
@@ -93,7 +93,7 @@ def ask(address: str, post: bool = False, **headers: str) -> tuple[int, Any]:
         return error.code, error.read()
 
 
-def test_the_page_tells_what_was_measured_of_the_newest_frame(recording, arrivals, tmp_path):
+def test_the_page_shows_what_was_measured_of_the_newest_frame(recording, arrivals, tmp_path):
     with shown(recording, arrivals, tmp_path, 20) as seen:
         look = json.loads(json.dumps(seen.page.look(), allow_nan=False))
     now = list(poses())[19]
@@ -187,7 +187,7 @@ def test_what_the_page_misses_is_counted_and_pictures_are_few(recording, arrival
     assert look["frame"] == 0, "the only picture"
 
 
-def test_before_the_first_frame_the_page_says_so_and_a_port_in_use_is_told(recording, tmp_path):
+def test_before_the_first_frame_the_page_says_so_and_a_port_in_use_is_reported(recording, tmp_path):
     page = LivePage(recording, tmp_path, Pipe()[1])
     assert page.look() == {"begun": False}
     assert "no frame is measured yet" in page.done(["stop"], {})["said"]
@@ -196,10 +196,10 @@ def test_before_the_first_frame_the_page_says_so_and_a_port_in_use_is_told(recor
 
 
 @pytest.mark.slow  # a process of its own, which imports torch
-def test_a_page_process_that_is_killed_is_told_and_tracking_goes_on(recording, arrivals):
-    told: list[str] = []
+def test_a_page_process_that_is_killed_is_reported_and_tracking_goes_on(recording, arrivals):
+    messages: list[str] = []
     running = Event()
-    page = PageProcess(EXCERPT / "experiment.yaml", None, 0, told.append)
+    page = PageProcess(EXCERPT / "experiment.yaml", None, 0, messages.append)
     try:
         page.begin(recording, running, None)
         folder = page.folder
@@ -207,18 +207,18 @@ def test_a_page_process_that_is_killed_is_told_and_tracking_goes_on(recording, a
         assert json.loads(ask(f"{page.address}look")[1])["frame"] == 0
         assert ask(f"{page.address}stop", post=True)[0] == 200
         page.process.kill()
-        until(lambda: told)
-        assert told == ["page: its process has ended; tracking goes on without the page."]
+        until(lambda: messages)
+        assert messages == ["page: its process has ended; tracking goes on without the page."]
         assert running.is_set(), "else it could not be started again"
         page.saw(arrivals[1], next(poses()))
     finally:
         page.close()
     assert not folder.exists()
-    assert len(told) == 1
+    assert len(messages) == 1
 
 
 @pytest.mark.slow  # a process of its own, which imports torch
-def test_what_is_wrong_with_the_files_is_told_by_the_loop_alone(tmp_path, capfd):
+def test_what_is_wrong_with_the_files_is_reported_by_the_loop_alone(tmp_path, capfd):
     (tmp_path / "experiment.yaml").write_text((EXCERPT / "experiment.yaml").read_text())  # without movies
     page = PageProcess(tmp_path / "experiment.yaml", None, 0, pytest.fail)
     page.process.join()

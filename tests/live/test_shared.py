@@ -77,7 +77,7 @@ def test_a_file_that_is_there_is_not_written_over(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="of POSIX")
-def test_a_disk_without_room_for_a_ring_is_told_before_it_is_written(tmp_path, monkeypatch):
+def test_a_disk_without_room_for_a_ring_is_refused_before_it_is_written(tmp_path, monkeypatch):
     def full(*given: int) -> None:
         raise OSError(28, "No space left on device")
 

@@ -90,7 +90,7 @@ def test_the_root_of_the_picture_makes_an_evenly_lit_disk_too_large_by_a_known_a
     assert 0.30 < outline.radius_px - radius < 0.45
 
 
-def test_two_disks_that_differ_by_a_fraction_of_a_pixel_are_told_apart():
+def test_two_disks_that_differ_by_a_fraction_of_a_pixel_are_distinguished():
     radii = np.array([outline_of(filmed(plant(white, *PLACES[0], r)), *PLACES[0]).radius_px for r in (38.0, 38.25)])
     assert abs(np.diff(radii)[0] - 0.25) < 0.03
 

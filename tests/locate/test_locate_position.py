@@ -95,7 +95,7 @@ def parallel() -> Camera:
     return TelecentricCamera(image_size=looking_down().image_size, scale_mm_px=scale, centre_px=middle, **pose)
 
 
-def test_a_telecentric_camera_tells_the_place_beside_another_one_and_none_by_itself():
+def test_a_telecentric_camera_gives_a_position_beside_another_one_and_none_by_itself():
     cameras = {"cam1": looking_along_y(), "cam2": parallel()}
     of_size = exact_radius_px(cameras["cam1"], PLACES), DIAMETER_MM / 2 / 0.23
     seen = {

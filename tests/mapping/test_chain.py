@@ -42,7 +42,7 @@ def test_loops_break_a_planted_drift_and_wrong_ones_do_not():
     wrong = turns_of(R, wrong.first, wrong.second, [0.0, 0.9, 0.4])
     closed, left = solve_graph(drifted, RelativeRotations.joined([chain, loops, wrong]), math.radians(1))
     assert error_deg(closed, R).max() < 0.6
-    assert torch.rad2deg(left[-len(wrong) :].norm(dim=-1)).min() > 30  # told apart from the right ones
+    assert torch.rad2deg(left[-len(wrong) :].norm(dim=-1)).min() > 30  # distinguished from the right ones
     alone, _ = solve_graph(drifted, chain, math.radians(1))
     assert error_deg(alone, R).max() > 5
 
@@ -107,10 +107,10 @@ def test_paint_alone_is_not_taken_for_a_pattern_of_the_sensor(count):
 
 
 def refused(whole):
-    with pytest.raises(PaintError) as told:
+    with pytest.raises(PaintError) as caught:
         find_chain(disks_of_pictures(whole), MapSettings())
-    assert "\n" not in str(told.value)
-    return str(told.value)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 def test_a_ball_that_never_turns_is_refused():

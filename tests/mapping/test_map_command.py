@@ -103,7 +103,7 @@ def test_an_old_map_is_corrected_and_keeps_its_frame_and_what_is_never_seen(copy
     against_old, against_true = (compare_maps(known, each) for each in (old, true))
     assert float(so3.angle(against_old.R_other_reference)) < np.deg2rad(0.3)
     assert against_true.rms_rad < 0.6 * against_old.rms_rad
-    # What no picture shows is the old map's, told as never seen.
+    # Paint that no picture shows comes from the old map and counts as unseen.
     assert 0.02 < float((seen == 0).float().mean()) < 0.8
     left = (new - old)[seen == 0].abs()
     assert float(left.median()) < 0.15  # its grey levels are fitted to the new ones
@@ -212,10 +212,10 @@ def test_two_maps_are_compared_and_wear_is_drawn(tmp_path, monkeypatch, capsys):
     arguments = ("compare-maps", tmp_path / "new.png", tmp_path / "old.png", "--out", tmp_path / "moved.png")
     code, said, err = run(monkeypatch, capsys, *arguments, "--json")
     assert code == 0, err
-    told = json.loads(said)
-    assert np.allclose(told["R_new_old"], Q.numpy(), atol=2e-3)
-    assert told["moved_rms_deg"] < 0.2
-    assert told["changed_share"] < 0.01
+    printed = json.loads(said)
+    assert np.allclose(printed["R_new_old"], Q.numpy(), atol=2e-3)
+    assert printed["moved_rms_deg"] < 0.2
+    assert printed["changed_share"] < 0.01
     assert cv2.imread(str(tmp_path / "moved.png")).shape[1] > 500
     write_seen(torch.zeros(96, 192), tmp_path / "new.png")
     assert run(monkeypatch, capsys, *arguments)[0] == 2  # nothing known in one of them: nothing to compare

@@ -18,7 +18,7 @@ def found(disks, first, second):
 
 
 @pytest.mark.parametrize(("cameras", "within_deg"), [(1, 0.6), (2, 0.6)])
-def test_two_renders_tell_how_the_ball_turned_without_a_map(cameras, within_deg):
+def test_two_renders_give_the_rotation_without_a_map(cameras, within_deg):
     R = turning(4, 11.0)
     first, second = torch.tensor([0, 1, 0]), torch.tensor([1, 2, 2])
     turns = found(disks_of_pictures(pictures(R, cameras)), first, second)

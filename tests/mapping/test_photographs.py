@@ -130,10 +130,10 @@ def test_views_compared_with_all_others_at_once_rank_rotations_as_pairs_one_by_o
 
 
 def refused(whole):
-    with pytest.raises(PaintError) as told:
+    with pytest.raises(PaintError) as caught:
         found_in(whole)
-    assert "\n" not in str(told.value)
-    return str(told.value)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 def test_too_few_photographs_are_refused():

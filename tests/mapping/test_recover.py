@@ -20,7 +20,7 @@ from sphereorient.mapping import MapSettings
 from sphereorient.mapping.learn import interpolated, recovered
 from sphereorient.movies import open_movie
 
-# Two turns and a half: over half a turn without a loop nothing tells a ball that is 1 % too large from a shorter turn.
+# Two turns and a half: half a turn without a loop fits a shorter turn as well as a ball that is 1 % too large.
 FRAMES = 120
 QUICK = MapSettings(rounds=6, pixels=600, height=64)
 

@@ -30,7 +30,7 @@ SETTINGS = Settings()
 
 @pytest.fixture(name="scene", scope="module", params=sorted(SCENE))
 def swaying_scene(request, tmp_path_factory):
-    """A small film: its experiment, the ball's place as outlines tell it, and the truth."""
+    """A small movie: its experiment, the ball's position from outlines, and the truth."""
     path = write_ball_scene(tmp_path_factory.mktemp("holder") / request.param, SCENE[request.param], FRAMES, 2)
     with h5py.File(path.with_name("truth.h5")) as file:
         R, X = (torch.from_numpy(file[name][()]) for name in ("orientation", "position"))
@@ -55,7 +55,7 @@ def off(scene, position_lab_mm, true) -> np.ndarray:
     return torch.cat([px, (sizes[0] / sizes[1] - 1)[:, None]], dim=1).numpy()
 
 
-def test_outlines_tell_the_place_in_each_frame(scene):
+def test_outlines_give_the_position_in_each_frame(scene):
     assert not scene.place.fixed
     away = off(scene, scene.place.position_lab_mm, scene.X)
     assert np.abs(away.mean(0)).max() < 0.6

@@ -1,4 +1,4 @@
-"""Turns between sets of points, against scipy; what markers can and cannot tell (docs/errata.md E8)."""
+"""Turns between sets of points, against scipy; what markers can and cannot show (docs/errata.md E8)."""
 
 import pytest
 import torch
@@ -76,7 +76,7 @@ def test_e8_kabsch_gives_the_increment_in_the_lab_so_the_body_components_stay_un
     assert_close(omega[5], omega_true, atol=1e-6)
     printed = to_body(R[5], omega_true)  # what it would be if it were the particle's
     assert (omega[5] - printed).norm() > 5
-    # two bodies with the same markers but other body axes look alike: nothing tells omega_body
+    # two bodies with the same markers but other body axes look alike: omega_body is unknown
     assert (to_body(R[5] @ R[2], omega[5]) - printed).norm() > 1
 
 

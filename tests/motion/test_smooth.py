@@ -407,24 +407,24 @@ def coupled(truth: Motion6D, rng: torch.Generator) -> tuple[Tensor, Tensor, Tens
     return truth.position_lab_mm - POSITION_MM * place, so3.exp(-turn) @ truth.R_lab_body, coupling
 
 
-def test_orientations_are_better_where_the_path_tells_the_error_of_the_position(rng: torch.Generator) -> None:
+def test_orientations_are_better_where_the_path_shows_the_error_of_the_position(rng: torch.Generator) -> None:
     truth = planted()
     X, R, coupling = coupled(truth, rng)
-    alone, told = (smoothed(truth, X, R, coupling=each) for each in (None, coupling))
+    alone, linked = (smoothed(truth, X, R, coupling=each) for each in (None, coupling))
     assert torch.equal(alone.R_given_path, R)
-    assert torch.equal(told.position_lab_mm, alone.position_lab_mm)
-    rms = [float(so3.log(truth.R_lab_body @ x.R_given_path.mT).square().mean().sqrt()) for x in (alone, told)]
+    assert torch.equal(linked.position_lab_mm, alone.position_lab_mm)
+    rms = [float(so3.log(truth.R_lab_body @ x.R_given_path.mT).square().mean().sqrt()) for x in (alone, linked)]
     # Of the shared error the part remains that the smoothed positions have.
-    left = float((told.position_lab_mm - truth.position_lab_mm).square().mean().sqrt()) / POSITION_MM
+    left = float((linked.position_lab_mm - truth.position_lab_mm).square().mean().sqrt()) / POSITION_MM
     expected = math.hypot(SHARED_PART * left, math.sqrt(1 - SHARED_PART**2)) * ORIENTATION_RAD
     assert rms[1] == pytest.approx(expected, rel=0.1)
     assert rms[1] < 0.8 * rms[0]
-    assert 0.85 < over_sigma(so3.log(truth.R_lab_body @ told.R_given_path.mT), told.cov_given_path_rad2) < 1.15
-    own = (1 - SHARED_PART**2) * (ORIENTATION_RAD * told.orientation_scale) ** 2 * torch.eye(3, dtype=torch.float64)
-    by_path = (SHARED_PART * ORIENTATION_RAD / POSITION_MM) ** 2 * told.position_cov_mm2
-    assert_close(told.cov_given_path_rad2, own + by_path, 1e-9 * ORIENTATION_RAD**2)
-    assert 0.8 < over_sigma(turn_off(truth, told), told.orientation_cov_rad2) < 1.25
-    smooth = [float(turn_off(truth, x).square().mean()) for x in (told, alone)]
+    assert 0.85 < over_sigma(so3.log(truth.R_lab_body @ linked.R_given_path.mT), linked.cov_given_path_rad2) < 1.15
+    own = (1 - SHARED_PART**2) * (ORIENTATION_RAD * linked.orientation_scale) ** 2 * torch.eye(3, dtype=torch.float64)
+    by_path = (SHARED_PART * ORIENTATION_RAD / POSITION_MM) ** 2 * linked.position_cov_mm2
+    assert_close(linked.cov_given_path_rad2, own + by_path, 1e-9 * ORIENTATION_RAD**2)
+    assert 0.8 < over_sigma(turn_off(truth, linked), linked.orientation_cov_rad2) < 1.25
+    smooth = [float(turn_off(truth, x).square().mean()) for x in (linked, alone)]
     assert smooth[0] < smooth[1]
 
 
@@ -432,9 +432,9 @@ def test_a_frame_whose_position_contradicts_the_path_keeps_its_orientation(rng: 
     truth = planted()
     X, R, coupling = coupled(truth, rng)
     X[50] += 20 * POSITION_MM
-    told = smoothed(truth, X, R, coupling=coupling)
-    assert torch.equal(told.R_given_path[50], R[50])
-    assert not torch.equal(told.R_given_path[51], R[51])
+    linked = smoothed(truth, X, R, coupling=coupling)
+    assert torch.equal(linked.R_given_path[50], R[50])
+    assert not torch.equal(linked.R_given_path[51], R[51])
 
 
 def test_the_share_of_errors_that_last_is_found_in_the_disagreement_of_cameras(rng: torch.Generator) -> None:
@@ -448,7 +448,7 @@ def test_the_share_of_errors_that_last_is_found_in_the_disagreement_of_cameras(r
         assert lasting_share(apart, cov, segment, 0.0) == pytest.approx(share, abs=0.12)
     assert lasting_share(white, cov, segment, 0.25) == 0.25  # never less than is assumed
     assert lasting_share(slow[:, :0], cov[:, :0], segment, 0.25) == 0.25  # a single camera
-    assert lasting_share(slow[:4], cov[:4], segment[:4], 0.25) < 0.35  # a few frames tell little
+    assert lasting_share(slow[:4], cov[:4], segment[:4], 0.25) < 0.35  # a few frames give little
     cov = cov.clone()
     cov[7] = 0.0  # a picture with few pixels left
     assert lasting_share(white, cov, segment, 0.25) == 0.25

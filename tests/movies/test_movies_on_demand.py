@@ -158,7 +158,7 @@ def test_a_stub_is_a_slice_whose_check_sum_is_right(first: bool) -> None:
 
 
 @pytest.mark.parametrize("slices", ["4", "6", "24"])
-def test_a_bright_ball_on_black_tells_the_slices_apart(tmp_path: Path, slices: str) -> None:
+def test_a_bright_ball_on_black_shows_where_the_slices_are(tmp_path: Path, slices: str) -> None:
     expected = pictures()
     expected[0][:] = 0
     expected[0][50:90, 60:100] = 200  # the others are bright everywhere

@@ -53,7 +53,7 @@ def test_a_damaged_frame_of_ffv1_is_the_only_one_lost(tmp_path, frame_rate_hz):
 
 
 def test_a_packet_that_is_gone_leaves_its_number_behind(tmp_path):
-    """The head of a block overwritten: Matroska skips it, and the stamps tell that one is missing."""
+    """The head of a block overwritten: Matroska skips it, and the stamps show that one is missing."""
     path = tmp_path / "movie.mkv"
     write_ffv1(path, pictures(), 600.0)
     at, _ = packet_places(path)[12]

@@ -156,7 +156,7 @@ def test_times_beside_the_data_set_are_the_movies(tmp_path, name):
     ],
     ids=["length", "stand still", "nan", "unit"],
 )
-def test_times_that_are_none_are_told_and_not_used(tmp_path, times, unit, word):
+def test_times_that_are_none_are_reported_and_not_used(tmp_path, times, unit, word):
     with h5py.File(tmp_path / "movie.h5", "w") as file:
         file["movie"], file["time"] = pictures(), times
         if unit:

@@ -75,6 +75,6 @@ def test_templates_as_soft_as_the_pictures_find_what_sharp_ones_miss():
     R = attitudes(24)
     disks = blurred_disks(R)
     soft = GreySearch(texture_of("patches"), GreySearchSettings(), blur=WIDE)
-    told = share_found(soft, disks, R)
-    assert told > 0.85
-    assert told > share_found(grey_search_of("patches"), disks, R) + 0.15
+    share = share_found(soft, disks, R)
+    assert share > 0.85
+    assert share > share_found(grey_search_of("patches"), disks, R) + 0.15

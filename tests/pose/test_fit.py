@@ -227,7 +227,7 @@ def test_light_of_low_order_over_the_disk_does_not_matter():
     assert apart_deg(fit, fitted(rig(), "patches", pixels, X, R, SIGMA)) < 0.05
 
 
-def test_saturated_pixels_tell_only_that_their_grey_level_is_at_least_that_one():
+def test_saturated_pixels_give_only_a_lower_bound_of_their_grey_level():
     X, R = truth()
     full = 0.5 * (BLACK + WHITE)  # nearly all white paint is clipped
     frames = pictures().clamp_max(full)
@@ -282,7 +282,7 @@ def test_a_bubble_before_part_of_the_disk_does_not_move_the_pose():
     assert (fit.score > 0.5).all()
 
 
-def test_the_score_tells_paint_from_a_smooth_disk_and_from_the_empty_scene():
+def test_the_score_distinguishes_paint_from_a_smooth_disk_and_from_the_empty_scene():
     """A blob that is lit from one side is explained to 90 % by shades alone: that is no evidence for the paint."""
     X, R = truth()
     _, ball = shares()
@@ -339,8 +339,8 @@ def test_what_a_camera_would_do_alone_is_what_it_fits_alone():
         use[:, camera] = True
         alone = fitted(rig(), "patches", disks(), X, R, SIGMA, iterations=8, use=use)
         places = alone.position_lab_mm, fit.position_lab_mm + fit.own_move[:, camera]
-        seen, told = (rig().cameras[camera].project(place) for place in places)
-        assert (seen - told).norm(dim=-1).max() < 0.02  # px
+        seen, projected = (rig().cameras[camera].project(place) for place in places)
+        assert (seen - projected).norm(dim=-1).max() < 0.02  # px
 
 
 def second_shows(X: Tensor, R: Tensor, **changes: object) -> FittedPoses:
@@ -459,7 +459,7 @@ def test_a_prior_beyond_doubt_holds_the_place_and_one_of_nothing_does_nothing():
     assert (along.position_lab_mm - fit.position_lab_mm)[:, [0, 2]].abs().max() < 0.02
 
 
-def test_score_and_likelihood_tell_wrong_poses():
+def test_score_and_likelihood_show_wrong_poses():
     right = from_truth()
     X, R = right.position_lab_mm, right.R_lab_body
     scores, nll = [], []

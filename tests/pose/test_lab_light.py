@@ -322,7 +322,7 @@ def test_lamps_that_only_one_camera_sees_stay_maps_of_the_disk():
     assert lit_in_the_lab(maps, pixels, fit, use)[:2] == (maps, fit)
 
 
-def test_two_lights_that_explain_as_much_are_both_told(monkeypatch):
+def test_two_lights_that_explain_as_much_are_both_reported(monkeypatch):
     rig, pixels, X, R, _ = pictures()
     maps, fit, use = of_maps(rig, pixels, X, R)
     monkeypatch.setattr(kinds, "ALIKE", math.inf)

@@ -112,7 +112,7 @@ def test_a_glint_follows_its_pixels_and_a_mat_ball_has_none(count: int):
     assert medians[0] < 0.5 < 0.8 < medians[1]
 
 
-def test_one_frame_tells_no_glints():
+def test_one_frame_gives_no_glints():
     pixels, fit, use, model = studied(1, LOBE, glints=True)
     at = fitted_residuals(pixels, fit, model)
     assert glint_shares(at, use, model.light.mirrors(at.view, pixels)).max() < 1e-6

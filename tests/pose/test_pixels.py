@@ -29,7 +29,7 @@ def camera(model: str) -> Camera:
 
 
 def places() -> np.ndarray:
-    """A picture whose grey level tells the pixel: u + 100 v."""
+    """A picture whose grey level is the pixel: u + 100 v."""
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     return (u + 100 * v).astype(np.float32)
 

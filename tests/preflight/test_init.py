@@ -197,7 +197,7 @@ def test_a_folder_of_plates_becomes_a_calibration(tmp_path):
     }
 
 
-def test_all_missing_keys_of_a_calibration_are_told_at_once(tmp_path):
+def test_all_missing_keys_of_a_calibration_are_reported_at_once(tmp_path):
     out = tmp_path / "calibration.yaml"
     init("--plate", plates(tmp_path / "plates", [Scene()]), "--out", out, "-q")
     with pytest.raises(CameraError) as refused:
@@ -218,7 +218,7 @@ def test_plate_pictures_are_paired_by_number(tmp_path):
         numbered_pictures(tmp_path / "nowhere")
 
 
-def test_a_folder_without_plates_is_told(tmp_path):
+def test_a_folder_without_plates_is_reported(tmp_path):
     cv2.imwrite(str(tmp_path / "a1.png"), np.full((100, 120), 90, np.uint8))
     said = init("--plate", tmp_path, "--out", tmp_path / "calibration.yaml")
     assert "no dots found in 1 pictures" in said
@@ -386,7 +386,7 @@ def test_half_a_pose_is_refused(tmp_path):
         load_cameras(tmp_path / "cameras.yaml")
 
 
-def test_a_movie_in_place_of_an_experiment_is_told(clean):
+def test_a_movie_in_place_of_an_experiment_is_reported(clean):
     with pytest.raises(ExperimentError, match=r"got a movie; .*`sphereorient init"):
         load_experiment(clean.folder / "cam1.mkv")
 

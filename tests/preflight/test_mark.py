@@ -158,7 +158,7 @@ def test_a_page_of_another_host_gets_nothing(marking, address):
         ("save/cam1", [1], "shapes and keep"),
     ],
 )
-def test_a_wrong_request_is_told_and_changes_nothing(marking, address, path, content, words):
+def test_a_wrong_request_is_reported_and_changes_nothing(marking, address, path, content, words):
     before = sorted(marking.path.parent.iterdir())
     status, said = ask(f"{address}/{marking.token}/{path}", content)
     assert status == 400

@@ -116,14 +116,14 @@ def test_a_saved_picture_can_be_clicked_again(marking):
         ("view/7", None, "0 .. 1"),
     ],
 )
-def test_a_wrong_request_is_told_and_changes_nothing(marking, address, path, content, words):
+def test_a_wrong_request_is_reported_and_changes_nothing(marking, address, path, content, words):
     status, said = ask(f"{address}/{path}", content)
     assert status == 400
     assert words in json.loads(said)["error"]
     assert marking.path.read_text() == FILE
 
 
-def test_a_file_that_cannot_be_changed_safely_stays_and_what_to_write_is_told(marking):
+def test_a_file_that_cannot_be_changed_safely_stays_and_what_to_write_is_reported(marking):
     changed = FILE.replace("# dusty\n", "\n    clicked:\n      # by hand\n      cam1: [[1, 2], [3, 4]]\n")
     marking.path.write_text(changed)
     points = clicks(*PLATE.fiducials)
@@ -179,7 +179,7 @@ def test_a_person_clicks_the_fiducials(marking, address, browser: Any, tmp_path:
 
 
 @pytest.mark.parametrize(("name", "kind"), [("calibration.yaml", FiducialMarking), ("experiment.yaml", MaskMarking)])
-def test_the_command_tells_the_files_apart(marking, name, kind, monkeypatch):
+def test_the_command_distinguishes_the_files(marking, name, kind, monkeypatch):
     seen = []
 
     def begin(self, path: Path) -> None:

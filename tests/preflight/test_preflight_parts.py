@@ -58,7 +58,7 @@ def test_the_expected_outline_encloses_the_spheres_picture_and_touches_it(camera
     assert got == pytest.approx(np.linalg.norm(hull - middle, axis=1).mean(), abs=0.03)
 
 
-def test_the_gap_is_that_of_triangulation_and_its_sign_tells_the_side():
+def test_the_gap_is_that_of_triangulation_and_its_sign_gives_the_side():
     uv = [f64([[150.0, 140.0], [160.0, 150.0]]), f64([[153.0, 120.0], [157.0, 170.0]])]
     gaps = gaps_between([ALONG_Y, DOWN_Z], uv)
     _, expected = triangulate(ALONG_Y.rays(uv[0]), DOWN_Z.rays(uv[1]))
@@ -104,7 +104,7 @@ def test_a_knock_does_not_hide_the_offset_where_the_motion_varies(late):
     assert steps.in_step_px > 30  # and what the knock leaves stays visible
 
 
-def test_a_ball_that_hardly_moves_tells_nothing():
+def test_a_ball_that_hardly_moves_gives_no_step():
     assert math.isnan(steps_of(2, moving=0.02).best)
 
 
@@ -152,7 +152,7 @@ def test_a_picture_holds_a_disk_that_touches_its_border_and_none_that_passes_it(
     assert holds_disk(ALONG_Y, centre, f64([30.0] * 5)).tolist() == [True, False, True, False, False]
 
 
-def test_disks_that_the_border_cuts_tell_nothing_of_motion_blur():
+def test_disks_that_the_border_cuts_give_no_motion_blur():
     still = motion_blur(sample_of(150.0, 152.0, 5.0, 290.0, 100.0, 101.0), 0.5, 1.0)
     assert still.severity is OK
     assert "1.50 px a frame" in still.measured

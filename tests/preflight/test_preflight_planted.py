@@ -43,7 +43,7 @@ def test_a_wrong_start_is_put_right(clean, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_ball_at_rest_cannot_tell_the_step(clean, tmp_path):
+def test_a_ball_at_rest_does_not_give_the_step(clean, tmp_path):
     def rest(movie: np.ndarray) -> np.ndarray:
         return movie[:1] + np.arange(len(movie))[:, None, None] % 2  # or the pictures would be repeated ones
 
@@ -112,7 +112,7 @@ def test_a_mirrored_movie_is_named(clean, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_movie_mirrored_left_to_right_is_told_by_the_lines_of_sight(clean, tmp_path):
+def test_a_movie_mirrored_left_to_right_is_found_by_the_lines_of_sight(clean, tmp_path):
     result = checked(clean.spoilt(lambda movie: movie[:, :, ::-1], ("cam1",)), tmp_path)
     found = of(result, "lines of sight")
     assert found.severity is FAULT

@@ -74,7 +74,7 @@ def test_what_is_wrong_with_a_paint_is_named(good, spoil, radius_px, words):
     assert words in found.advice
 
 
-def test_views_of_a_random_paint_can_be_told_apart(pair):
+def test_views_of_a_random_paint_can_be_distinguished(pair):
     assert look_alikes(pair).severity is OK
     assert pair.score > 0.3  # something is always a little alike
 

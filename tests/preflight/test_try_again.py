@@ -97,7 +97,7 @@ def test_what_was_tried_is_saved_and_all_else_stays(marking):
         ({"shapes": [{"kind": "hide", "u": 75, "v": 75, "radius": 500}]}, "all of it hidden"),
     ],
 )
-def test_impossible_values_are_told_and_change_nothing(marking, asked, words):
+def test_impossible_values_are_reported_and_change_nothing(marking, asked, words):
     before = {path.name: path.read_bytes() for path in marking.path.parent.iterdir()}
     for what in ("track", "adopt"):
         with pytest.raises(SphereOrientError, match=words):

@@ -194,7 +194,7 @@ def test_every_flag_and_reason_has_words():
     assert len(set(words)) == len(words)
 
 
-def test_doubts_are_told_in_words():
+def test_doubts_are_shown_in_words():
     track = true_track()
     assert frame_warnings(track, 3) == []
     bad = changed(track, 3, flags=Flag.SPIKE | Flag.ONE_CAMERA, valid=False)
@@ -348,7 +348,7 @@ def test_the_command_writes_movie_and_sheet(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         ([], "expected something to write, got neither --out nor --worst"),
         (["--out", "o.mp4", "--frames", "9:3"], "--frames 9:3: expected A:B, A below B"),
@@ -356,11 +356,11 @@ def test_the_command_writes_movie_and_sheet(tmp_path, monkeypatch, capsys):
         (["--out", "o.avi"], "expected .mp4 .m4v .mov .mkv, got '.avi'"),
     ],
 )
-def test_the_command_refuses_in_one_line(tmp_path, monkeypatch, capsys, words, told):
+def test_the_command_refuses_in_one_line(tmp_path, monkeypatch, capsys, words, message):
     monkeypatch.chdir(tmp_path)
     true_track().save(tmp_path / "track.h5")
     code, _, said = command(monkeypatch, capsys, "overlay", EXCERPT / "experiment.yaml", "track.h5", *words)
     assert code == 2
-    assert told in said
+    assert message in said
     assert said.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["track.h5"]

@@ -645,7 +645,7 @@ def test_angles_have_densities_by_degree_beside_the_uniform_law():
         (np.nan, "uniformity of the orientations could not be tested"),
     ],
 )
-def test_the_test_of_uniformity_is_told_in_words(p_value, words):
+def test_the_test_of_uniformity_is_reported_in_words(p_value, words):
     note = note_of(plots.angles_figure(planted_angles(), uniformity(p_value)))
     assert note.startswith(words)
     assert np.isnan(p_value) or "12,345 frames in 77 segments, worth 210 independent" in note
@@ -737,7 +737,7 @@ def test_what_a_smoother_lost_is_not_called_noise_and_without_any_the_axis_is_li
         (np.nan, 1.0, 2.0, "unknown"),
     ],
 )
-def test_an_interval_is_told_with_the_digits_it_deserves(value, low, high, words):
+def test_an_interval_is_printed_with_its_significant_digits(value, low, high, words):
     of = Interval(value=np.array(value), low=np.array(low), high=np.array(high), error=np.array(0.1))
     assert interval_text(of) == words
     if np.isfinite(low):

@@ -108,9 +108,9 @@ def test_paint_that_was_not_used_is_drawn(place, report, tmp_path):
 @pytest.mark.slow
 def test_many_tracks_make_one_page_that_needs_nothing_beside_it(place, report, tmp_path):
     out = tmp_path / "page"
-    code, told, _ = report(place / "a/track.h5", place / "b/track.h5", "--out", out, *QUICK)
+    code, printed, _ = report(place / "a/track.h5", place / "b/track.h5", "--out", out, *QUICK)
     assert code == 0
-    assert told.rstrip().endswith(f"Wrote {out / 'index.html'}")
+    assert printed.rstrip().endswith(f"Wrote {out / 'index.html'}")
     page = (out / "index.html").read_text()
     assert "a/track.h5" in page
     assert "b/track.h5" in page

@@ -33,14 +33,14 @@ def body():
 
 
 @pytest.mark.slow
-def test_a_flow_with_axes_is_told_from_a_body_with_axes(body):
+def test_a_flow_with_axes_is_distinguished_from_a_body_with_axes(body):
     flow = draw_ensemble(EnsembleSpec(segments=250, mean_frames=90.0, omega_rms=(7.0, 12.0, 8.0)), 12)
     assert "prefers directions of the lab and none of the body" in said(flow)["Isotropy of omega"].words
     assert "prefers directions of the body and none of the lab" in said(body)["Isotropy of omega"].words
 
 
 @pytest.mark.slow
-def test_rows_that_belong_to_no_frame_are_told(lab):
+def test_rows_that_belong_to_no_frame_are_reported(lab):
     good = said(lab)
     assert good["Frame of omega_lab"].grade == "good"
     assert good["Frame of omega_body"].grade == "good"
@@ -60,7 +60,7 @@ def test_tails_are_named_by_their_kind(lab):
 
 
 @pytest.mark.slow
-def test_attitudes_that_prefer_a_direction_are_told(lab):
+def test_attitudes_that_prefer_a_direction_are_reported(lab):
     assert said(lab)["Orientations"].grade == "neutral"
     still = np.tile(np.eye(3), (len(lab), 1, 1))
     biased = replace(lab, orientation_smooth=np.where((lab.segment % 4 == 0)[:, None, None], still, lab.orientation))
@@ -90,7 +90,7 @@ def test_remarks_of_the_run_are_repeated_once(lab):
     assert words.startswith("cam2 is a frame late; ")
 
 
-def test_distances_are_told_in_degrees(lab):
+def test_distances_are_reported_in_degrees(lab):
     part = lab.at(np.arange(5000))
     edges = np.linspace(0, 0.2, 11)
     one = CameraDistance(cameras=("a", "b"), distance_rad=np.full(9, 0.1), edges_rad=edges, pdf=np.ones(10),
@@ -102,7 +102,7 @@ def test_distances_are_told_in_degrees(lab):
     assert "without correction of perspective by 11°" in words
 
 
-def test_without_a_segment_that_counts_the_reason_is_told(lab):
+def test_without_a_segment_that_counts_the_reason_is_reported(lab):
     short = lab.at(np.flatnonzero(lab.segment == np.bincount(lab.segment).argmax())[:30])
     found = said(short)
     assert found["Segments"].grade == "doubt"

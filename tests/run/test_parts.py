@@ -116,8 +116,8 @@ def test_parts_of_another_run_are_refused_with_what_differs(store, tmp_path):
         store.held(of_one, resume=True),
     ):
         pass
-    told = json.loads((store.folder / "run.json").read_text())
-    (store.folder / "run.json").write_text(json.dumps(told | {"cam1.mkv": "12 34"}))
+    saved = json.loads((store.folder / "run.json").read_text())
+    (store.folder / "run.json").write_text(json.dumps(saved | {"cam1.mkv": "12 34"}))
     request = request_to(tmp_path / "track.h5")
     with pytest.raises(TrackError, match=r"with another cam1\.mkv;"), store.held(request, resume=True):
         pass

@@ -92,7 +92,7 @@ def test_parts_cut_off_while_written_are_measured_again(whole, tmp_path, request
 
 
 @pytest.mark.slow
-def test_a_damaged_part_is_told_and_measured_again_by_the_next_run(whole, tmp_path, request_of):
+def test_a_damaged_part_is_reported_and_measured_again_by_the_next_run(whole, tmp_path, request_of):
     request = request_of(tmp_path)
     parts = halfway(whole, request)
     (part,) = sorted(parts.folder.glob("poses-*"))[:1]

@@ -69,7 +69,7 @@ def test_a_finer_grid_answers_more_exactly():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_it_tells_a_mirrored_picture_and_a_mirrored_map_from_the_right_one(kind):
+def test_it_distinguishes_a_mirrored_picture_and_a_mirrored_map_from_the_right_one(kind):
     disks = clean_disks(kind, attitudes(10))
     mirrored_search = TemplateBank(texture_of(kind).flip(1), SIZE, OrientSettings())
 

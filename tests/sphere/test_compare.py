@@ -85,7 +85,7 @@ def test_the_shift_of_east_and_north_has_the_sign_of_the_map(paint):
 
 
 @pytest.mark.slow
-def test_what_either_map_does_not_know_is_not_told(paint):
+def test_what_either_map_does_not_know_is_not_compared(paint):
     half = paint.clone()
     half[:, :HEIGHT] = torch.nan  # the western half
     found = compare_maps(turned_map(half, TURN.mT), paint)

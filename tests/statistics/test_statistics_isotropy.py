@@ -27,7 +27,7 @@ def verdict(spec: EnsembleSpec) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("frame", ["lab", "body"])
-def test_the_frame_that_has_axes_is_told_from_the_other(frame):  # docs/errata.md E6
+def test_the_frame_that_has_axes_is_distinguished_from_the_other(frame):  # docs/errata.md E6
     assert verdict(EnsembleSpec(segments=200, mean_frames=120, frame=frame, **UNEQUAL)) == frame
 
 

@@ -194,9 +194,9 @@ def test_noise_has_its_standard_deviation_at_each_grey_level():
     for level in (25.0, 100.0):
         many = flat(level, torch.float64).expand(8, SIZE, SIZE)  # 74,000 pixels: 0.3 % of sigma
         read = degrade(many, disk((8,)), {"read_noise": 7.0}, seeded()) - level
-        shot = degrade(many, disk((8,)), {"shot_noise": 0.8}, seeded()) - level
+        noise = degrade(many, disk((8,)), {"shot_noise": 0.8}, seeded()) - level
         assert float(read.std()) == pytest.approx(7.0, rel=0.02)
-        assert float(shot.std()) == pytest.approx(0.8 * math.sqrt(level), rel=0.02)
+        assert float(noise.std()) == pytest.approx(0.8 * math.sqrt(level), rel=0.02)
         assert abs(float(read.mean())) < 0.1
         neighbours = (read[..., 1:] * read[..., :-1]).mean() / read.var()
         assert abs(float(neighbours)) < 0.02

@@ -100,11 +100,11 @@ def test_what_lies_on_the_disk_of_one_ball_is_refused_of_several(name, tmp_path)
 
 
 @pytest.mark.slow
-def test_degradations_of_the_picture_and_of_what_is_told_take_several_balls(written, tmp_path):
+def test_degradations_of_the_picture_and_of_input_files_take_several_balls(written, tmp_path):
     values = {"background_clutter": 20.0, "defocus": 1.0, "radius_error": 1.2, "texture_error": 0.1, "paint_wear": 0.2}
     path = write_synthetic_experiment(tmp_path, SMALL, values=values)
-    told = load_experiment(path)
-    assert [sphere.diameter_mm for sphere in told.spheres] == pytest.approx([12.0 * 1.1] * 4)
+    given = load_experiment(path)
+    assert [sphere.diameter_mm for sphere in given.spheres] == pytest.approx([12.0 * 1.1] * 4)
     wrong = [
         (load_texture(tmp_path / f"texture_{k}.png") - load_texture(written.parent / f"texture_{k}.png")).abs() > 0.5
         for k in range(3)

@@ -149,7 +149,7 @@ def test_places_are_one_across_the_maps_edge_and_over_its_poles():
 
 
 @pytest.mark.slow
-def test_the_command_tells_and_draws_a_series(tmp_path, monkeypatch, capsys):
+def test_the_command_prints_and_draws_a_series(tmp_path, monkeypatch, capsys):
     paths = [save_map(learnt(k), tmp_path / f"movie{k}.png") for k in range(3)]
     write_seen((~near(FIRST_SPOT, 0.0)).long() * 20, tmp_path / "movie0.png")
     code, said, err = run(monkeypatch, capsys, "compare-maps", "--series", *paths, "--out", tmp_path / "wear.png")
@@ -159,14 +159,14 @@ def test_the_command_tells_and_draws_a_series(tmp_path, monkeypatch, capsys):
     assert cv2.imread(str(tmp_path / "wear.png")).shape[1] > 500
     code, said, err = run(monkeypatch, capsys, "compare-maps", "--series", *paths[:2], "--json")
     assert code == 0, err
-    told = json.loads(said)
-    assert [row["map"] for row in told["maps"]] == [str(paths[1])]
-    assert told["maps"][0]["stays_share"] is None
-    assert [row["worn_share"] for row in told["maps"]] == pytest.approx(
+    printed = json.loads(said)
+    assert [row["map"] for row in printed["maps"]] == [str(paths[1])]
+    assert printed["maps"][0]["stays_share"] is None
+    assert [row["worn_share"] for row in printed["maps"]] == pytest.approx(
         [one.worn for one in found().growth[:1]], rel=0.05
     )
-    assert all(row["moved_rms_deg"] < 0.4 for row in told["maps"])
-    assert len(told["places"]) == 1
+    assert all(row["moved_rms_deg"] < 0.4 for row in printed["maps"])
+    assert len(printed["places"]) == 1
 
 
 def test_maps_that_make_no_pair_and_no_series_are_refused_in_one_line(tmp_path, monkeypatch, capsys):

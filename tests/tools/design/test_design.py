@@ -261,9 +261,9 @@ def test_bad_input_gets_one_line(arguments, says, tmp_path, monkeypatch, capsys)
     with pytest.raises(SystemExit) as stopped:
         cli.main()
     assert stopped.value.code == 2
-    told = capsys.readouterr().err
-    assert says in told
-    assert told.count("\n") == 1
+    message = capsys.readouterr().err
+    assert says in message
+    assert message.count("\n") == 1
 
 
 @pytest.mark.slow  # judges 18 maps
