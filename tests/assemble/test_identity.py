@@ -59,7 +59,7 @@ def test_a_ball_that_was_hidden_for_some_frames_is_the_one_that_is_missing():
     assert np.isnan(sure[:, :42]).all()
 
 
-def test_balls_that_meet_while_nobody_sees_them_are_said_to_be_in_doubt():
+def test_balls_that_meet_while_no_camera_sees_them_are_marked_as_doubtful():
     X, R = motions(1)
     apart = np.where(TIME_S < 0.1, 20 * (0.1 - TIME_S), 20 * (TIME_S - 0.1))[:, None] * np.array([1.0, 0, 0])
     X = np.concatenate([X - apart, X + apart])

@@ -171,7 +171,7 @@ def test_the_true_candidate_is_found_among_false_ones_that_stand_and_that_are_an
     assert (marginals[:, 0] > 0.97).all()
 
 
-def test_frames_in_which_no_candidate_is_right_say_none_and_empty_frames_nothing(rng):
+def test_frames_in_which_no_candidate_is_right_get_none_and_empty_frames_nothing(rng):
     R = turning(60, 4.0)
     R[20] = so3.random_rotations((), generator=rng)
     every = movie(R)
@@ -190,7 +190,7 @@ def test_frames_in_which_no_candidate_is_right_say_none_and_empty_frames_nothing
     assert marginals[43, 0] > 0.9  # the motion goes on behind the hole
 
 
-def test_what_the_pictures_say_decides_between_twins(rng):
+def test_the_pictures_likelihood_decides_between_twins(rng):
     R = turning(30, 4.0)
     nll = torch.stack([torch.full((30,), 0.5), torch.zeros(30)], 1).double()
     half = so3.exp(torch.tensor([0.0, 0.0, torch.pi], dtype=torch.float64))

@@ -172,7 +172,7 @@ def test_a_turn_far_off_the_motion_parts_segments_although_no_break_is_thought_p
     assert physical_path(pooled(seen(R, rng)), times(100), small).segment.tolist() == [0] * 100
 
 
-def test_a_turn_of_more_than_half_a_circle_over_a_hole_is_counted_by_what_omega_says(rng):
+def test_a_rotation_by_more_than_half_a_turn_over_a_gap_is_counted_by_omega(rng):
     R = turning(100, 45.0)
     path = physical_path(without(seen(R, rng), range(50, 55)), times(100), SETTINGS)
     assert path.segment.tolist() == [0] * 100

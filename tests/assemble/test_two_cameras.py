@@ -85,7 +85,7 @@ def as_pair(wrong: str, deceived, right):
 
 
 @pytest.mark.parametrize(("false_score", "true_score"), [(0.9, 0.85), (0.99, 0.7)])
-def test_a_camera_deceived_for_a_stretch_is_repaired_from_the_other_whatever_the_scores(wrong, false_score, true_score):
+def test_a_camera_wrong_for_a_stretch_is_repaired_from_the_other_whatever_the_scores(wrong, false_score, true_score):
     R = turning(60)
     pair = as_pair(wrong, sees(R, false_in=STRETCH, false_score=false_score), sees(R, true_score=true_score))
     track = contradiction(*pair, deceived=[wrong])

@@ -268,7 +268,7 @@ def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, words):
     assert words in said
 
 
-def test_a_file_says_which_scenes_and_an_option_wins(tmp_path, monkeypatch, capsys):
+def test_a_file_names_the_scenes_and_an_option_wins(tmp_path, monkeypatch, capsys):
     config = tmp_path / "bench.yaml"
     config.write_text("degradations: [defocus]\nlevels: [2]\nseeds: [0]\ntogether: 0\nframes: 12\n")
     seen = []

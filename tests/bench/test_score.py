@@ -137,7 +137,7 @@ def test_percentiles_are_the_median_two_tails_and_the_worst(truth):
     np.testing.assert_allclose(score.percentiles_mm(), [1.95, 3.705, 3.861, 3.9], rtol=1e-6)
 
 
-def test_a_frame_without_a_position_is_not_valid_whatever_the_track_says(truth):
+def test_a_frame_without_a_position_is_not_valid_whatever_the_tracks_flag(truth):
     track = perfect(truth)
     position = track.position.copy()
     position[3] = np.nan

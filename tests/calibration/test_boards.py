@@ -220,7 +220,7 @@ def test_sixteen_bits_are_read_too() -> None:
     assert len(see_plate(picture.astype(np.uint16) * 16, board)) == 42
 
 
-def test_boards_are_read_as_calibration_yaml_says_them() -> None:
+def test_boards_are_read_as_calibration_yaml_defines_them() -> None:
     assert plate_from_entry({"type": "chessboard", "columns": 7, "rows": 6, "pitch": 10.0}) == chess(7, 6)
     charuco = {"type": "charuco", "columns": 8, "rows": 6, "pitch": 10.0, "marker": 7.0, "dictionary": "DICT_4X4_50"}
     assert plate_from_entry(charuco) == CHARUCO

@@ -68,7 +68,7 @@ def test_a_camera_that_never_saw_the_surveyed_pose_is_tied_by_the_others(rng):
 
 
 @pytest.mark.slow
-def test_what_a_port_is_can_be_fitted_and_the_covariance_says_how_well(rng):
+def test_a_port_can_be_fitted_and_the_covariance_states_its_error(rng):
     rig = planted(rng, walls=True, count=10, tilt_deg=35.0, shift_mm=25.0)
     seen = views(rig, rng)
     made = problem(rig, seen, ("port_n_fluid",))

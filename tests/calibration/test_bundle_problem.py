@@ -72,7 +72,7 @@ def test_a_change_turns_cameras_in_their_own_frame_and_plates_in_the_lab(rng):
     assert not torch.allclose(moved.R_lab_plate[2], wrong, atol=1e-4)
 
 
-def test_poses_that_nobody_sees_are_no_unknowns(rng):
+def test_poses_that_no_camera_sees_are_no_unknowns(rng):
     rig = planted(rng, count=4)
     seen = {name: {row: view for row, view in rows.items() if row != 2} for name, rows in views(rig, rng).items()}
     assert problem(rig, seen).free == [1, 3]

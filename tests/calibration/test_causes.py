@@ -69,7 +69,7 @@ CAMERAS = default_cameras(SynthSettings())
 
 @pytest.mark.parametrize("seed", [0, 1, *map(slow, range(2, 6))])
 @pytest.mark.parametrize("consecutive", [False, True])
-def test_cameras_that_agree_are_left_in_peace(seed, consecutive):
+def test_cameras_that_agree_get_no_finding(seed, consecutive):
     seen = seen_by(CAMERAS, seed=seed)
     found = compare_cameras(replace(seen, frame=torch.arange(len(seen.centre_px)) if consecutive else None), LIMITS)
     assert not found.contradicts
@@ -167,7 +167,7 @@ def test_a_late_movie_is_named(late, frames):
     assert f"the movie of cam2 {abs(late)} frames {'late' if late > 0 else 'early'}" in found.advice
 
 
-def test_a_camera_that_says_nothing_in_some_frames_does_not_matter():
+def test_a_camera_without_measurements_in_some_frames_does_not_matter():
     seen = seen_by(CAMERAS, diameter_mm=1.05 * MM)
     for name in ("centre_px", "radius_px", "R_lab_body"):
         getattr(seen, name)[::2, 1] = torch.nan
@@ -193,7 +193,7 @@ def late(seen: Seen, camera: int) -> Seen:
 
 
 @pytest.mark.parametrize("wrong", [0, slow(1), slow(2)])
-def test_of_three_cameras_the_one_that_contradicts_the_others_is_named_alone(wrong):
+def test_the_one_of_three_cameras_that_contradicts_the_others_is_named_alone(wrong):
     name = list(THREE)[wrong]
     others = tuple(k for k in range(3) if k != wrong)
     turned_one = reported(seen_by(THREE), THREE | {name: turned(THREE[name], 1.5, 0)})
@@ -224,7 +224,7 @@ def test_a_shift_that_two_of_three_cameras_measure_is_decided_by_the_size_in_the
     assert not any(other in advice for other in THREE if other != name)
 
 
-def test_of_four_cameras_two_that_agree_are_no_majority():
+def test_two_of_four_cameras_that_agree_are_no_majority():
     cameras = dict(FOUR)
     for k, name in enumerate(("cam3", "cam4")):
         cameras[name] = turned(FOUR[name], 2.0 + 3 * k, k)

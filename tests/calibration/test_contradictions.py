@@ -118,7 +118,7 @@ def test_a_gap_turns_a_pose_between_two_pictures_but_not_that_of_one_camera():
         np.testing.assert_allclose(added, half_mm / (MM / 2) * rolls, rtol=0.02)
 
 
-def test_what_lasts_is_added_by_the_cameras_that_measured_a_frame():
+def test_the_error_that_lasts_is_added_by_the_cameras_that_measured_a_frame():
     rng = np.random.default_rng(5)
     whole, cam1, cam2 = (torch.from_numpy(a @ np.swapaxes(a, -1, -2)) for a in (rng.normal(size=(3, 6, 6))))
     alone = torch.stack([cam1, cam2])
@@ -214,7 +214,7 @@ def test_a_camera_that_two_others_overrule_widens_nothing_and_marks_nothing():
     assert "cam1" not in found.advice
 
 
-def test_of_three_cameras_in_use_one_that_is_off_moves_the_mean_by_a_third():
+def test_one_camera_of_three_that_is_off_moves_the_mean_by_a_third():
     marked, _ = with_contradictions(track_of({"cam3": 1.0}, {}, of=THREE), THREE, MM, True)
     assert (marked.flags == Flag.CONTRADICTION).all()
     sigma = np.degrees(np.sqrt(marked.orientation_cov[:, 0, 0]))

@@ -78,7 +78,7 @@ def test_pixels_that_are_not_square_are_of_the_sensor(rng):
         guess_rig(document(rig, "pinhole", pitch=(0.01, 0.02)), views(rig, rng))
 
 
-def test_two_pictures_are_too_few_and_it_says_so(rng):
+def test_two_pictures_are_refused_as_too_few(rng):
     rig = planted(rng)
     seen = views(rig, rng)
     seen["cam2"] = {row: seen["cam2"][row] for row in (0, 1)}

@@ -203,7 +203,7 @@ ENTRY = {
 }
 
 
-def test_a_plate_is_read_as_calibration_yaml_says_it() -> None:
+def test_a_plate_is_read_as_calibration_yaml_defines_it() -> None:
     plate = plate_from_entry(ENTRY)
     assert plate == PLATE
     assert isinstance(plate, DotPlate)

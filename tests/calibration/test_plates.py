@@ -141,7 +141,7 @@ def test_a_picture_without_fiducials_is_tied_through_the_other_camera(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_floating_picture_of_a_pose_that_nobody_else_saw_is_left_out_with_the_reason(tmp_path):
+def test_an_untied_picture_of_a_pose_that_no_other_camera_saw_is_left_out_with_the_reason(tmp_path):
     path = write(tmp_path)
     redrawn(tmp_path, "cam1_04.png", without=HIDDEN)
     result = calibrate_cameras(path)
@@ -252,7 +252,7 @@ def test_a_wall_that_does_not_stand_before_the_camera_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_tie_needs_a_pose_that_somebody_knows(source, result):
+def test_a_tie_needs_a_known_pose(source, result):
     document = load_calibration(source)
     views = see_pictures(document, lambda stage, done, total: None)
     rig = Rig(cameras=result.cameras, R_lab_plate=result.R_lab_plate, T_lab_plate_mm=result.T_lab_plate_mm)

@@ -97,7 +97,7 @@ def test_cameras_that_stand_right_stay(rng):
 
 
 @pytest.mark.slow
-def test_what_the_sphere_does_not_determine_is_named(rng):
+def test_parameters_that_the_sphere_does_not_determine_are_named(rng):
     """How far the second camera stands away along its own axis: its lines of sight hardly move."""
     calibrated = cameras()
     truly = calibrated | {"cam2": bumped(calibrated["cam2"], *bump(rng))}
@@ -147,7 +147,7 @@ def test_too_few_frames_and_one_camera_are_refused(rng):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["cam1", "cam3"])
-def test_of_three_cameras_the_bumped_one_is_put_right_and_the_others_stay(rng, name):
+def test_the_bumped_one_of_three_cameras_is_put_right_and_the_others_stay(rng, name):
     calibrated = default_cameras(SynthSettings(cameras=3))
     turn, move = bump(rng)
     truly = calibrated | {name: bumped(calibrated[name], 3 * turn, 3 * move)}

@@ -160,7 +160,7 @@ def test_frames_without_a_position_have_no_systematic_error(rng):
     assert empty[0].shape == (0, 3, 3)
 
 
-def test_what_is_exact_in_all_cameras_leaves_nothing(rng):
+def test_exact_cameras_leave_no_systematic_error(rng):
     rig = cameras()
     known = covariance(rng)
     exact = ParameterCovariance(names=known.names, matrix=0 * known.matrix)

@@ -188,7 +188,7 @@ def opencv_text(**changed: str) -> str:
         ({}, 568.94),
     ],
 )
-def test_the_file_says_which_lens_its_four_numbers_are_of(tmp_path, key, u):
+def test_the_file_names_the_lens_of_its_four_numbers(tmp_path, key, u):
     (tmp_path / "cam.yml").write_text(opencv_text(**key))
     camera = load_opencv(tmp_path / "cam.yml")
     assert float(camera.project(f64((321.394, 0.0, 383.022)))[0]) == pytest.approx(u, abs=0.01)

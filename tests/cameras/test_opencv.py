@@ -66,7 +66,7 @@ def test_without_a_pose_the_lab_is_the_camera_and_four_coefficients_end_with_p2(
     assert camera.p.tolist() == [2e-3, -1.5e-3]
 
 
-def test_a_size_that_the_file_does_not_say_is_given(tmp_path):
+def test_a_size_that_the_file_lacks_is_given(tmp_path):
     path = opencv_file(tmp_path / "cam.yml", image_width=None, image_height=None)
     assert load_opencv(path, image_size=SIZE).image_size == SIZE
     with pytest.raises(CameraError, match="two whole numbers, got none"):

@@ -115,7 +115,7 @@ YAML = "num_cams: 1\nptv:\n  splitter: false\n  img_name: [a, b]\n  imx: 1280\n 
 YAML += "  pix_y: 0.011\n  chfield: 0\n  mmp_n1: 1.0\n  mmp_n2: 1.49\n  mmp_n3: 1.33\n  mmp_d: 6.0\n  hp_flag: true\n"
 
 
-def test_openptvs_yaml_and_lists_of_four_names_say_the_same_as_ptv_par(tmp_path):
+def test_openptvs_yaml_and_lists_of_four_names_give_the_same_as_ptv_par(tmp_path):
     _, _, par = files(tmp_path, par=PAR + TANK)
     (tmp_path / "parameters_Run1.yaml").write_text(YAML)
     (tmp_path / "padded.par").write_text(PAR.replace("cal/cam2.tif\n", "cal/cam2.tif\n\n\n---\n---\n") + TANK)

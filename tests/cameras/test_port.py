@@ -168,7 +168,7 @@ class Disguised:
         return getattr(self.camera, name)
 
 
-def test_a_camera_whose_centre_is_not_known_sees_the_same(rng):
+def test_a_camera_whose_centre_is_not_known_has_the_same_lines_of_sight(rng):
     known = behind_port(tsai())
     unknown = PortCamera(camera=Disguised(tsai()), port=known.port)
     x_lab_mm = in_liquid(rng, 50)

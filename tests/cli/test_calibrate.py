@@ -69,7 +69,7 @@ def test_calibrate_writes_cameras_and_a_picture_and_prints_tables(tmp_path, monk
     assert "sphereorient calibrate" in (tmp_path / "cameras.yaml").read_text().splitlines()[0]
 
 
-def test_what_a_user_can_mend_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, capsys):
+def test_a_fault_that_a_user_can_mend_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, capsys):
     path = write(tmp_path, {"surveyed": document()["surveyed"] | {"pose": 99}}, drawn=False)
     code, out, err = command(monkeypatch, capsys, "calibrate", path, "--out", tmp_path / "cameras.yaml")
     assert code == 2

@@ -228,7 +228,7 @@ def test_a_table_whose_counter_begins_anew_is_cut_there(on_a_ball, tmp_path):
     assert found["gain"]["value"][:3] == pytest.approx([1.0, 0.97, 1.0], abs=2e-3)
 
 
-def test_behaviour_is_printed_and_a_short_track_says_why_not(on_a_ball, tmp_path):
+def test_behaviour_is_printed_and_for_a_short_track_the_reason(on_a_ball, tmp_path):
     printed = CliRunner().invoke(app, ["score", str(tmp_path / "track.h5"), str(tmp_path / "truth.h5")]).output
     assert "0.9700" in printed
     assert all(word in printed for word in ("gain, smoothed", "drift (degrees a minute)", "ratio of path lengths"))

@@ -121,7 +121,7 @@ def test_a_single_telecentric_camera_is_refused(still, tmp_path):
         run("track", out, "--out", tmp_path / "t.h5", "-q")
 
 
-def test_the_field_of_view_is_asked_for_not_assumed(still, tmp_path):
+def test_a_missing_field_of_view_is_refused_and_not_assumed(still, tmp_path):
     out, cameras = tmp_path / "experiment.yaml", tmp_path / "cameras.yaml"
     said = run("init", photograph(still), "--out", out, "--sphere-map", still / "texture.png")
     assert "write in cameras.yaml: cameras.cam1.vfov_deg" in said

@@ -141,7 +141,7 @@ def test_the_excerpt_is_tracked_by_each_camera_alone(name):
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_each_camera_also_says_what_it_sees_by_itself(excerpt, name):
+def test_each_camera_also_gives_the_pose_that_it_measures_alone(excerpt, name):
     score = score_track(excerpt, EXCERPT / "truth.h5")
     assert np.median(score.camera_orientation_deg[name]) < 0.2
     assert set(excerpt.cameras[name].reason) == {Reason.OK}
@@ -204,7 +204,7 @@ def test_when_both_cameras_are_blind_for_20_frames_nothing_is_invented(brisk, tm
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "along"), [("cam1", 2), ("cam2", 1)])
-def test_when_one_camera_is_blind_the_other_goes_on_and_says_so(brisk, tmp_path, name, along):
+def test_when_one_camera_is_blind_the_other_goes_on_and_the_flag_is_set(brisk, tmp_path, name, along):
     """`along`: the lab axis along which the camera that is left looks."""
     blind = np.arange(50, 70)
     track = followed(brisk.without_ball(blind, (name,)), tmp_path)
@@ -355,7 +355,7 @@ def test_a_mirrored_map_is_refused_of_soft_pictures_too(brisk, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CAMERAS)
-def test_one_camera_alone_loses_no_frame_and_knows_what_it_does_not_see(brisk, tmp_path, name):
+def test_one_camera_alone_loses_no_frame_and_its_covariance_shows_the_unseen_direction(brisk, tmp_path, name):
     track = followed(brisk, tmp_path, cameras=(name,))
     assert list(track.cameras) == [name]
     assert 0.5 < rms(in_sigmas(track.position - brisk.position_mm, track.position_cov)) < 1.8

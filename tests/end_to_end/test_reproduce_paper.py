@@ -128,7 +128,7 @@ def test_a_broken_folder_of_movies_is_refused_in_one_line(tmp_path, monkeypatch)
         assert {"expected", "got"} <= set(re.findall(r"\w+", line))
 
 
-def test_what_a_stage_made_stays_until_its_own_code_changes(tmp_path, monkeypatch):
+def test_results_of_a_stage_stay_until_its_own_code_changes(tmp_path, monkeypatch):
     plan = reproduce_paper.QUICK
     for number, stage in ((1, "film"), (2, "film"), (1, "paper"), (1, "precise"), (2, "precise")):
         made = reproduce_paper.made_by(tmp_path, number, stage)

@@ -170,7 +170,7 @@ def test_the_python_call_gives_the_same_bytes_as_the_command(tmp_path):
 
 
 @pytest.mark.slow
-def test_one_camera_alone_tracks_the_orientation_and_says_so(tmp_path):
+def test_one_camera_alone_tracks_the_orientation_and_the_flag_is_set(tmp_path):
     out, experiment = tmp_path / "one.h5", shortened(tmp_path / "copy", 0, 12)
     run = sphereorient("track", experiment, "--method", "paper", "--out", out, "--cameras", "cam2", "--quiet")
     assert run.returncode == 0, run.stderr

@@ -54,7 +54,7 @@ def test_time_is_frame_number_over_frame_rate_and_does_not_restart_with_frames(f
     assert time_s[0] != 5 / 600.0  # nor by the second movie's own frames
 
 
-def test_a_movie_that_ends_early_has_no_pictures_of_the_last_frames_and_a_remark_says_so(folder):
+def test_a_movie_that_ends_early_has_no_pictures_of_the_last_frames_and_a_remark(folder):
     frames = line(folder, BOTH)
     assert frames.rows["cam1"].tolist() == [*range(12), NONE, NONE, NONE]
     assert frames.rows["cam2"].tolist() == list(range(15))

@@ -43,14 +43,14 @@ def scattered(trials: int, count: int, seed: int = 4) -> tuple[Tensor, Tensor]:
     return (root @ errors)[..., 0], root @ root.mT
 
 
-def test_the_mean_place_errs_as_its_covariance_says():
+def test_the_mean_position_errs_as_its_covariance_states():
     X, covariance = scattered(trials=400, count=12)
     found = [mean_place(one, covariance) for one in X]
     away = torch.stack([place @ torch.linalg.solve(C, place) for place, C in found])
     assert float(away.mean()) == pytest.approx(3.0, rel=0.25), "chi squared of three coordinates"
 
 
-def test_frames_that_are_far_off_hardly_move_the_mean_place():
+def test_frames_that_are_far_off_hardly_move_the_mean_position():
     X, covariance = scattered(trials=1, count=12)
     good, _ = mean_place(X[0], covariance)
     spoilt = X[0].clone()
@@ -78,7 +78,7 @@ def test_a_single_frame_gives_the_position_with_its_own_error():
     assert_close(C, covariance[0], 1e-9)
 
 
-def test_attitudes_err_with_the_place_as_follows_says():
+def test_attitudes_err_with_the_position_as_follows_states():
     rig, (X, R) = rig_of(40.0, ("pinhole",)), balls(4, 1, reach_mm=0.0)
     pixels, use = cut(rig, pictures_of(rig, "patches", X, R), X), torch.ones(4, 1, dtype=torch.bool)
 

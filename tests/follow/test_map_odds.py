@@ -70,7 +70,7 @@ def test_odds_against_the_mirror_image_are_those_of_the_mirror_image_against_the
     assert float(odds(0.7, 0.4).log_odds) == pytest.approx(-float(odds(0.4, 0.7).log_odds))
 
 
-def test_pictures_add_their_odds_and_one_without_a_disk_says_nothing():
+def test_pictures_add_their_odds_and_one_without_a_disk_adds_none():
     both = MapOdds(score=torch.tensor([[0.7], [0.6], [torch.nan]]), mirrored=torch.tensor([[0.4], [0.5], [torch.nan]]))
     assert float(both.log_odds) == pytest.approx(float(odds(0.7, 0.4).log_odds + odds(0.6, 0.5).log_odds))
 

@@ -58,7 +58,7 @@ def test_the_next_pose_continues_the_motion_whatever_the_times(frames, change):
     assert_close(so3.exp(f64(expected.turn)) @ f64(expected.R_before), so3.exp(angle(3.2, change) * AXIS), 1e-6)
 
 
-def test_of_a_change_of_the_turn_within_the_scatter_of_poses_half_goes_on():
+def test_half_of_a_change_of_rotation_within_the_scatter_of_poses_goes_on():
     exact, times = lane([0, 1, 2], 0.02, [0.0, 1.0, 2.0, 3.0]), [0.0, 1.0, 2.0, 3.0]
     scattered = Chunk(0, times, past=exact.past.copy(), turns=exact.turns.copy())
     for k, (number, poses) in enumerate(exact.past):

@@ -71,7 +71,7 @@ def test_the_same_checkpoint_gives_the_same_bytes(tmp_path):
     assert (tmp_path / "a" / "proposer.ckpt").read_bytes() == (tmp_path / "b" / "proposer.ckpt").read_bytes()
 
 
-def test_the_network_of_a_checkpoint_says_what_it_said_before(tmp_path, rng):
+def test_the_network_of_a_checkpoint_predicts_the_same_as_before(tmp_path, rng):
     save_checkpoint(tmp_path / "proposer.ckpt", example())
     network = correlator_of(load_checkpoint(tmp_path / "proposer.ckpt"))
     disks, blurs = 100 * torch.rand(2, 24, 24, generator=rng), torch.randn(32 * 32, 7, generator=rng)
@@ -219,7 +219,7 @@ def test_a_changed_checkpoint_is_refused_in_one_line(tmp_path, case):
     assert words in refused(path)
 
 
-def test_what_would_be_refused_is_not_written(tmp_path):
+def test_a_checkpoint_that_would_be_refused_is_not_written(tmp_path):
     with pytest.raises(CheckpointError, match="finite"):
         save_checkpoint(tmp_path / "bad.ckpt", example(**other_weight(torch.tensor(float("nan")))))
     assert not list(tmp_path.iterdir())

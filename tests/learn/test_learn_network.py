@@ -35,7 +35,7 @@ def smooth_map(R_body_ball: np.ndarray, height: int = 256) -> Tensor:
 
 
 @pytest.mark.parametrize("degree", [1, 2])
-def test_a_spherical_harmonic_decays_as_the_kernel_says(degree):
+def test_a_spherical_harmonic_decays_as_the_kernel_predicts(degree):
     """A kernel exp(kappa cos) shrinks those of degree 1 by coth(kappa) - 1 / kappa, of degree 2 by 1 - 3 of it / kappa.
 
     About exp(-l (l + 1) s^2 / 2) where s is small.

@@ -58,7 +58,7 @@ def test_training_finds_what_the_untrained_network_does_not(trained):
 
 
 @pytest.mark.slow
-def test_the_checkpoint_is_the_best_of_the_validations_and_says_what_it_is(trained):
+def test_the_checkpoint_is_that_of_the_best_validation_and_holds_its_description(trained):
     result, folder = trained
     loaded = load_checkpoint(folder / "proposer.ckpt")
     assert same(loaded, result.checkpoint)
@@ -93,7 +93,7 @@ def test_the_same_seed_gives_the_same_weights_and_another_does_not(short, tmp_pa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cut", [5, 8, 9])
-def test_what_was_cut_off_goes_on_to_the_same_weights(short, tmp_path, cut):
+def test_an_interrupted_training_goes_on_to_the_same_weights(short, tmp_path, cut):
     """Cut off in the second epoch, at its very end, in the third."""
 
     def interrupt(stage: str, done: int, total: int) -> None:
@@ -252,7 +252,7 @@ def test_judging_counts_right_and_wrong(rng):
 
 
 @pytest.mark.slow
-def test_the_network_of_the_checkpoint_is_as_good_as_the_log_says(trained):
+def test_the_network_of_the_checkpoint_is_as_good_as_in_the_log(trained):
     """Loaded anew, on the same validation pictures."""
     from sphereorient.learn.metrics import joined_predictions, predict
     from sphereorient.learn.train import TrainingData

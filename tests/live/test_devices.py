@@ -79,7 +79,7 @@ def with_keys(recording: Recording, **keys: DeviceKeys) -> Recording:
     return replace(recording, experiment=replace(recording.experiment, devices=keys))
 
 
-def test_pictures_are_copies_with_the_devices_time_and_what_waits_is_asked_again(maker, alone, monkeypatch):
+def test_pictures_are_copies_with_the_devices_time_and_waiting_ones_are_read_again(maker, alone, monkeypatch):
     camera = body([TIMEOUT, (grey(1), 70.0, 5), TIMEOUT, TIMEOUT, (grey(2), 70.25, 6), (grey(3), 70.5, 8)])
     install(maker, [camera], monkeypatch)
     frames = source_of(f"{maker}4711", print).frames(alone)
@@ -92,7 +92,7 @@ def test_pictures_are_copies_with_the_devices_time_and_what_waits_is_asked_again
     assert camera.log[-1] == "closed"
 
 
-def test_a_device_is_set_as_the_experiment_says(maker, alone, monkeypatch):
+def test_a_device_is_set_as_in_the_experiment(maker, alone, monkeypatch):
     camera = body([(grey(1), 1.0, 1)])
     install(maker, [camera], monkeypatch)
     keys = DeviceKeys(trigger="Line1", exposure_ms=0.4, rate_hz=600.0, pixel_format="Mono8", offset=(8, 4))

@@ -41,7 +41,7 @@ def test_a_frame_that_waits_for_the_tracking_arrives_when_it_is_taken():
             assert before_s <= next(frames).arrived_s <= time.perf_counter()
 
 
-def test_of_a_camera_that_is_too_fast_frames_are_passed_over_in_steps_that_grow():
+def test_frames_of_a_camera_that_is_too_fast_are_skipped_in_growing_steps():
     goes_on, numbers = Semaphore(9), []
     feed = Feed(let(60, goes_on), 64, wait=False)
     frames = iter(feed)

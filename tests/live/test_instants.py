@@ -85,7 +85,7 @@ def whole(shown: list[list[int | None]]) -> float:
     return np.mean([None not in row for row in shown])
 
 
-def test_pictures_of_one_trigger_are_one_instant_whatever_the_clocks_say():
+def test_pictures_of_one_trigger_are_one_instant_whatever_the_clocks():
     shown, messages = together(Rig())
     assert whole(shown[20:]) == 1
     assert shown[-1] == [399, 399]

@@ -127,7 +127,7 @@ def test_a_full_disk_is_reported_once_and_does_not_stop(tmp_path):
     assert "expected a disk with room" in messages[0]
 
 
-def test_a_disk_that_hangs_holds_nobody_up_and_what_is_lost_is_counted():
+def test_a_disk_that_hangs_holds_nothing_up_and_lost_lines_are_counted():
     going, written = Event(), []
 
     def write(things: list[int]) -> None:

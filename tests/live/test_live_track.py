@@ -67,7 +67,7 @@ def blocks_of(run) -> TrackBlocks:
     return TrackBlocks(recording=run[0], tracker=run[1], even=True, settings=Settings(), command="sphereorient live")
 
 
-def test_the_track_says_of_each_frame_what_was_measured(run, tmp_path):
+def test_the_track_states_of_each_frame_what_was_measured(run, tmp_path):
     blocks, path = blocks_of(run), tmp_path / "track.h5"
     output = TrackOutput(path, pytest.fail)
     output.begin(blocks)

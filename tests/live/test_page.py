@@ -136,7 +136,7 @@ def served(recording, arrivals, tmp_path) -> Iterator[tuple[Shown, str]]:
         server.server_close()
 
 
-def test_others_get_nothing(served):
+def test_requests_without_the_token_get_nothing(served):
     seen, place = served
     base = place.removesuffix(f"{TOKEN}/")
     for path in ("", "look", "wrong/look", f"{TOKEN}/nothing"):
@@ -177,7 +177,7 @@ def test_a_map_is_saved_where_one_is_learnt(served, recording, arrivals, tmp_pat
             seen.page.done(["save"], {})
 
 
-def test_what_the_page_misses_is_counted_and_pictures_are_few(recording, arrivals, tmp_path, monkeypatch):
+def test_poses_that_the_page_misses_are_counted_and_pictures_are_few(recording, arrivals, tmp_path, monkeypatch):
     """More poses than the ring holds before the page looks for the first time."""
     monkeypatch.setattr("sphereorient.live.page.PICTURES_HZ", 1e-3)
     monkeypatch.setattr("sphereorient.live.page.POSES", 16)
@@ -187,7 +187,7 @@ def test_what_the_page_misses_is_counted_and_pictures_are_few(recording, arrival
     assert look["frame"] == 0, "the only picture"
 
 
-def test_before_the_first_frame_the_page_says_so_and_a_port_in_use_is_reported(recording, tmp_path):
+def test_before_the_first_frame_the_page_shows_that_and_a_port_in_use_is_refused(recording, tmp_path):
     page = LivePage(recording, tmp_path, Pipe()[1])
     assert page.look() == {"begun": False}
     assert "no frame is measured yet" in page.done(["stop"], {})["said"]

@@ -250,7 +250,7 @@ def test_a_blurred_ball_that_never_leaves_its_place_is_not_taken_for_noise_of_th
     assert np.hypot(found[0].u_px - 80.0, found[0].v_px - 75.0) < 6
 
 
-def test_what_glitters_stays_hidden_also_where_no_ball_is_found():
+def test_glitter_stays_hidden_also_where_no_ball_is_found():
     rng = np.random.default_rng(5)
     frames = np.stack([filmed(np.full(SHAPE, BACK, np.float32), seed=k) for k in range(24)])
     frames[:, 40:100, 60:120] = rng.integers(60, 250, (24, 60, 60))

@@ -154,7 +154,7 @@ def test_the_spread_of_half_a_rim_is_that_of_its_geometry():
 
 @pytest.mark.parametrize("paint", [white, blobs])
 @pytest.mark.parametrize("u", [-14.0, -7.0, 0.0, 12.0])
-def test_a_disk_that_the_border_cuts_is_as_wrong_as_its_spread_says(u, paint):
+def test_a_disk_that_the_border_cuts_is_as_wrong_as_its_spread_states(u, paint):
     outline = outline_of(filmed(plant(paint, u, 80.0)), u, 80.0, LocateSettings(coverage_min=0.2))
     error = np.array([outline.u_px - u, outline.v_px - 80.0, outline.radius_px - DIAMETER / 2])
     scale = max(outline.rms_px, 0.2)  # the known error of the radius is no scatter
@@ -244,7 +244,7 @@ def test_the_same_picture_gives_the_same_outline():
 
 @pytest.mark.parametrize("colour", [4.0, 40.0, 110.0], ids=["darker", "brighter", "bright"])
 @pytest.mark.parametrize("angle", [0.4, 2.2, 4.0])
-def test_what_passes_before_the_ball_as_round_and_as_large_is_not_taken_for_it(angle, colour):
+def test_a_round_thing_of_the_same_size_that_passes_before_the_ball_is_not_taken_for_it(angle, colour):
     """Its rim is whole, the ball's is not; but nothing is painted on it."""
     place, radius = (99.37, 84.81), DIAMETER / 2
     before = np.array(place) + radius * np.array([np.cos(angle), np.sin(angle)])
@@ -259,7 +259,7 @@ def test_what_passes_before_the_ball_as_round_and_as_large_is_not_taken_for_it(a
 
 
 @pytest.mark.parametrize("wider", [-0.03, 0.0, 0.03])
-def test_a_disk_that_is_wider_than_high_says_by_how_much(wider):
+def test_the_ratio_of_a_disk_that_is_wider_than_high_is_measured(wider):
     u, v = 40.3, 38.7
     picture = plant(white, u, v)
     turn = np.float32([[1 + wider / 2, 0, -u * wider / 2], [0, 1 - wider / 2, v * wider / 2]])

@@ -106,7 +106,7 @@ def followed(ball, numbers, place=None) -> list[Poses]:
     return [follower.next(k / RATE_HZ, [ball.frames[k]])[0] for k in numbers]
 
 
-def test_the_first_pass_follows_a_ball_of_which_nothing_is_known(ball):
+def test_the_first_pass_follows_a_ball_without_a_map(ball):
     place = replace(ball.place, position_lab_mm=ball.X[:1])
     found = followed(ball, range(70), place)
     R = torch.cat([poses.R_lab_body for poses in found])

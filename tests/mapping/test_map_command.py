@@ -183,7 +183,7 @@ def test_masks_that_are_none_are_refused(copy, tmp_path, monkeypatch, capsys, ma
     assert words in refused(monkeypatch, capsys, "map", copy, "--out", tmp_path / "map.png")
 
 
-def test_maps_on_disk_say_what_was_never_seen(tmp_path):
+def test_maps_on_disk_mark_unseen_paint(tmp_path):
     texture = torch.tensor([[0.0, 1.0, 0.25, torch.nan]] * 2).repeat(4, 4)
     counts = torch.tensor([[3, 300, 1, 0]] * 2).repeat(4, 4)
     write_texture(texture, tmp_path / "map.png")

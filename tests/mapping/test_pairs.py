@@ -29,7 +29,7 @@ def test_two_renders_give_the_rotation_without_a_map(cameras, within_deg):
     assert so3.geodesic_distance(turns.R_ji.mT, R[second] @ R[first].mT).min() > 0.2
 
 
-def test_what_one_camera_shows_is_found_again_by_the_other():
+def test_paint_that_one_camera_shows_is_found_again_by_the_other():
     # A quarter turn about lab y carries what camera 1 sees before camera 2.
     quarter = so3.exp(torch.tensor([0.0, math.pi / 2, 0.0], dtype=torch.float64))
     start = so3.exp(torch.tensor([0.2, 0.4, -0.3], dtype=torch.float64))

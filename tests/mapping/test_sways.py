@@ -101,13 +101,13 @@ def test_a_ball_that_is_taken_as_fixed_is_refused_with_what_to_write(scene):
         held_place(recording, SETTINGS.paint, SETTINGS.locate)
 
 
-def test_init_knows_that_it_sways(scene):
+def test_init_finds_that_the_ball_sways(scene):
     (look,) = look_at([scene.path.with_name("cam1.mkv")])
     assert look.stays
     assert look.sways
 
 
-def test_a_path_without_outliers_is_smoothed_as_much_as_it_asks_for():
+def test_outliers_are_left_out_and_the_path_is_smoothed_by_its_own_noise():
     rng, k = np.random.default_rng(0), np.arange(200)
     true = np.stack([100 + 3 * np.sin(k / 15), 80 + 0.1 * k, 40 + np.cos(k / 25)], axis=1)
     noisy = true + rng.normal(0, 0.3, true.shape)

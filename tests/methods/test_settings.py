@@ -71,7 +71,7 @@ def refused(*overrides: str, path: Path | None = None, load=load_settings) -> st
     return text
 
 
-def test_without_a_file_all_is_as_the_rooms_say():
+def test_without_a_file_all_settings_are_the_defaults_of_the_rooms():
     assert load_settings() == Settings()
     assert load_settings().locate == LocateSettings()
     assert list(Settings.model_fields) == ROOMS

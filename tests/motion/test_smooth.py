@@ -157,7 +157,7 @@ def test_slow_errors_are_covered_by_the_share_that_is_set_aside_for_them(rng: to
 @pytest.mark.parametrize(
     ("omega_rms", "lost"), [slow(10.5, (60, 80)), slow(22.0, (60, 72)), (292.0, (60, 72))], ids=str
 )
-def test_a_gap_is_bridged_with_sigmas_that_say_how_well(
+def test_a_gap_is_bridged_with_sigmas_as_large_as_the_errors(
     omega_rms: float, lost: tuple[int, int], rng: torch.Generator
 ) -> None:
     truth = planted(omega_rms)
@@ -291,7 +291,7 @@ def test_time_backwards_turns_rates_around(rng: torch.Generator) -> None:
 
 
 @pytest.mark.slow
-def test_segments_know_nothing_of_each_other(rng: torch.Generator) -> None:
+def test_segments_do_not_depend_on_each_other(rng: torch.Generator) -> None:
     truth = planted()
     position, R = measured(truth, rng)
     segment = torch.zeros(len(R), dtype=torch.long)

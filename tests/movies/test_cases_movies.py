@@ -43,7 +43,7 @@ def test_a_movie_that_was_cut_without_encoding_is_whole():
     assert not remarks(movie, "truncated")
 
 
-def test_an_interlaced_movie_says_what_to_do():
+def test_an_interlaced_movie_gets_a_remark_with_advice():
     assert remarks(open_movie(CASES / "interlaced" / "interlaced.mp4"), "interlaced")
 
 
@@ -74,18 +74,18 @@ def test_a_fourth_axis_of_one_channel_is_read(name):
     assert middle(movie) == pytest.approx((120, 70), abs=1.5)
 
 
-def test_a_file_of_labels_asks_for_the_movie():
+def test_a_file_of_labels_is_refused_with_a_hint_to_the_movie():
     with pytest.raises(MovieError, match="labelled"):
         open_movie(CASES / "hdf5_four_axes" / "pkg.slp")
 
 
-def test_the_rotation_tag_is_said():
+def test_the_rotation_tag_is_remarked_upon():
     for name, turn in (("rot180.mp4", 180), ("rot90.mp4", 270)):
         assert remarks(open_movie(CASES / "rotation_tag" / name), f"{turn} degrees clockwise")
 
 
 @pytest.mark.parametrize("unit", ["ms", "us", "ns"])
-def test_units_that_no_file_states_are_asked_for(tmp_path, monkeypatch, capsys, unit):
+def test_units_that_no_file_states_are_refused(tmp_path, monkeypatch, capsys, unit):
     for name in (f"{unit}.h5", "texture.png"):
         (tmp_path / name).symlink_to(CASES / "time_units" / name)
     monkeypatch.chdir(tmp_path)
@@ -115,7 +115,7 @@ def test_convert_keeps_a_phones_time_stamps_beside_the_movie(tmp_path, monkeypat
     assert load_times(tmp_path / "out.times.csv") == pytest.approx(times_s, abs=1e-12)
 
 
-def test_convert_leaves_out_times_whose_unit_nobody_knows(tmp_path, monkeypatch, capsys):
+def test_convert_leaves_out_times_of_unknown_unit(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     code, out, _ = run(monkeypatch, capsys, "convert", str(CASES / "time_units" / "ms.h5"), "out.h5")
     assert code == 0

@@ -166,7 +166,7 @@ def test_times_that_are_none_are_reported_and_not_used(tmp_path, times, unit, wo
     assert word in movie.remarks[0]
 
 
-def test_hdf5_with_several_movies_asks_for_a_name(tmp_path):
+def test_hdf5_with_several_movies_is_refused_without_a_name(tmp_path):
     path = tmp_path / "movie.h5"
     with h5py.File(path, "w") as file:
         file["a/x"], file["b/x"], file["c"] = pictures(), pictures(), np.zeros(3)

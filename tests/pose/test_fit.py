@@ -319,7 +319,7 @@ def test_a_camera_alone_would_not_turn_what_it_has_fitted():
     assert_close(fit.own_move, torch.zeros_like(fit.own_move), atol=1e-6)
 
 
-def test_what_the_cameras_would_do_alone_adds_up_to_nothing():
+def test_changes_by_each_camera_alone_add_up_to_zero():
     fit = from_truth()
     weight = torch.linalg.inv(fit.own_covariance)
     mean = torch.linalg.solve(weight.sum(1), (weight @ fit.own_turn[..., None]).sum(1))[..., 0]
@@ -331,7 +331,7 @@ def test_what_the_cameras_would_do_alone_adds_up_to_nothing():
     assert 0.7 < rms(torch.linalg.solve_triangular(root, apart, upper=False)) < 1.5
 
 
-def test_what_a_camera_would_do_alone_is_what_it_fits_alone():
+def test_the_change_by_a_camera_alone_is_its_own_fit():
     X, R = truth()
     fit = from_truth()
     for camera in range(2):
@@ -351,7 +351,7 @@ def second_shows(X: Tensor, R: Tensor, **changes: object) -> FittedPoses:
     return fitted(rig(), "patches", cut(rig(), frames, truth()[0]), *truth(), SIGMA, **changes)
 
 
-def test_cameras_that_show_different_attitudes_say_by_how_much():
+def test_disagreement_of_cameras_in_attitude_is_measured():
     X, R = truth()
     delta = f64([0.006, -0.004, 0.008])
     # The place held: else it moves to where paint and limb disagree least, and takes a part of the turn.
@@ -363,7 +363,7 @@ def test_cameras_that_show_different_attitudes_say_by_how_much():
     assert ((share > 0.2) & (share < 0.8)).all()
 
 
-def test_cameras_that_show_different_places_say_by_how_much():
+def test_disagreement_of_cameras_in_position_is_measured():
     # Lab x lies across both lines of sight.
     X, R = truth()
     fit = second_shows(X + f64([0.03, 0.0, 0.0]), R)
@@ -430,7 +430,7 @@ def prior_pull(precision: float) -> tuple[Tensor, FittedPoses]:
     return (fit.position_lab_mm - free.position_lab_mm)[:, 1] / 0.2, fit
 
 
-def test_a_prior_pulls_as_its_information_says():
+def test_a_prior_pulls_by_its_information():
     # With information I a prior of precision p moves the place by p / (p + I) of the way: I follows from one, the
     # others must agree.
     known = 100.0
@@ -475,7 +475,7 @@ def test_score_and_likelihood_show_wrong_poses():
 
 
 @pytest.mark.slow
-def test_the_likelihood_falls_off_as_the_covariance_says():
+def test_the_likelihood_falls_off_as_the_covariance_states():
     # Three standard deviations from the best pose the negative logarithm is 4.5 higher; noise moves its minimum.
     count = 40
     fit = from_truth(count=count)
@@ -592,14 +592,14 @@ def check_coverage(cameras: str, scaled: Tensor, in_sigmas: Tensor) -> None:
 
 
 @pytest.mark.parametrize("cameras", [pytest.param("two", marks=SLOW), "one"])
-def test_errors_are_as_large_as_the_covariance_says(cameras):
+def test_errors_are_as_large_as_the_covariance_states(cameras):
     check_coverage(cameras, *drawn(64.0, cameras, "patches", 20, 6))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["patches", "blobs"])
 @pytest.mark.parametrize("cameras", RIGS)
-def test_errors_of_2000_noisy_renders_are_as_large_as_the_covariance_says(cameras, kind):
+def test_errors_of_2000_noisy_renders_are_as_large_as_the_covariance_states(cameras, kind):
     scaled, in_sigmas = drawn(64.0, cameras, kind, 200, 10)
     assert len(scaled) == 2000
     check_coverage(cameras, scaled, in_sigmas)

@@ -112,7 +112,7 @@ def test_starts_that_are_nan_are_not_used():
     assert torch.autograd.grad(got.cost.sum() + got.position_lab_mm[1].sum(), scale)[0].isfinite()
 
 
-def test_what_nothing_determines_stays_and_has_no_gradient(points):
+def test_an_undetermined_direction_stays_and_has_no_gradient(points):
     # One point: a turn about it, and turns against moves, leave the residual as it is.
     seen = (points[:, :1] + 0.1).requires_grad_()
     got = fitted_points(torch.zeros_like(points[:, :1]), seen)
@@ -122,7 +122,7 @@ def test_what_nothing_determines_stays_and_has_no_gradient(points):
     assert_close(gradient, torch.ones_like(gradient), 1e-6)
 
 
-def test_a_fit_that_has_not_arrived_says_so_and_gives_no_gradient(points):
+def test_a_fit_that_has_not_converged_is_marked_and_gives_no_gradient(points):
     seen = (points @ so3.exp(f64([2.0, 1.0, -1.0])).mT).requires_grad_()
     got = fitted_points(points, seen, iterations=1)
     assert not got.arrived.any()

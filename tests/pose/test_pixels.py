@@ -40,7 +40,7 @@ def disk(model: str = "pinhole", middle=(30.2, 20.7), radius_px: float = 9.0, st
 
 
 @pytest.mark.parametrize("model", ["pinhole", "tsai", "telecentric"])
-def test_every_pixel_looks_where_the_camera_says(model):
+def test_every_pixel_looks_along_its_line_of_sight(model):
     pixels = disk(model)
     uv = torch.stack([pixels.grey[0] % 100, torch.div(pixels.grey[0], 100, rounding_mode="floor")], dim=-1).double()
     rays = camera(model).rays(uv)
@@ -52,7 +52,7 @@ def test_every_pixel_looks_where_the_camera_says(model):
 
 
 @pytest.mark.parametrize("kind", ["pinhole", "fisheye", "port", "telecentric"])
-def test_a_balls_size_says_how_far_it_is_also_behind_a_port(kind):
+def test_a_balls_size_gives_its_distance_also_behind_a_port(kind):
     lens = (
         behind_port(pinhole())
         if kind == "port"

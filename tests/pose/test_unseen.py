@@ -39,13 +39,13 @@ def rms_deg(found) -> float:
 
 
 @pytest.mark.slow
-def test_what_the_map_holds_there_moves_nothing(pixels, known):
+def test_values_of_the_map_there_move_nothing(pixels, known):
     white = fit(pixels, 1.0, known=True)
     apart = so3.geodesic_distance(known.R_lab_body, white.R_lab_body)
     assert float(apart.max()) < math.radians(0.03)  # a fiftieth of the fill reaches over the border
 
 
-def test_the_pose_is_as_good_as_the_known_paint_and_its_error_says_so(pixels, known):
+def test_the_pose_is_as_good_as_the_known_paint_and_so_is_its_stated_error(pixels, known):
     assert rms_deg(known) < 0.15
     assert rms_deg(fit(pixels, 0.5, known=False)) > 3 * rms_deg(known)
     error = torch.cat([turn_errors(known, R), X - known.position_lab_mm], -1)

@@ -118,7 +118,7 @@ def test_live_on_a_movie_agrees_with_fictracs_formulas(monkeypatch, capsys):
 
 
 @pytest.mark.shared
-def test_the_sample_of_fictrac_looks_where_fictrac_says(tmp_path):
+def test_the_sample_of_fictrac_has_the_rotation_of_fictrac(tmp_path):
     axes = fictrac_axes(camera(np.eye(3)), SAMPLE / "config.txt")
     towards = (axes.R_cam_own @ axes.R_own_lab).T @ [0.0, 0.0, 1.0]
     np.testing.assert_allclose(towards, [-0.22939, 0.09997, 0.96819], atol=2e-5)  # as its README has it

@@ -91,7 +91,7 @@ def test_text_figure_and_files_name_one_outline(tmp_path):
     assert load_experiment(out).circles["cam1"] == pytest.approx(look.outline.circle, abs=0.06)
 
 
-def test_a_given_circle_agrees_or_its_difference_is_said_and_the_picture_counts(tmp_path):
+def test_a_given_circle_agrees_or_its_difference_is_reported_and_the_picture_counts(tmp_path):
     look = seen(film(tmp_path / "ball.npy", 0.2))
     u, v, radius = CIRCLE
     right, wrong = with_circle(look, (u, v + 1, radius - 1)), with_circle(look, (u, v - 12, 0.67 * radius))

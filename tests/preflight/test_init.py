@@ -78,7 +78,7 @@ def test_two_movies_become_an_experiment(clean, tmp_path):
     assert cv2.imread(str(tmp_path / "experiment.png")) is not None
 
 
-def test_what_nobody_knows_is_asked_for_by_name_and_refused_at_once(clean, tmp_path):
+def test_unknown_values_are_requested_by_name_in_one_refusal(clean, tmp_path):
     said = init(*two_movies(clean, tmp_path), "--out", tmp_path / "experiment.yaml")
     assert re.findall(r"write in experiment.yaml: ([\w.]+),", said) == ["frame_rate", "sphere.diameter"]
     assert "moves, found in" in said
@@ -96,7 +96,7 @@ def test_the_look_measures_the_ball(clean, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_look_knows_a_ball_that_stays(tmp_path):
+def test_the_look_finds_a_ball_that_stays(tmp_path):
     settings = SynthSettings(frames=40, image_size=(200, 200), diameter_px=60.0, velocity_rms=0.0, volume_mm=1e-3)
     write_synthetic_experiment(tmp_path, settings)
     (look,) = look_at([tmp_path / "cam1.mkv"])
@@ -106,7 +106,7 @@ def test_the_look_knows_a_ball_that_stays(tmp_path):
     assert "fixed, outline" in said
 
 
-def test_a_movie_without_a_ball_says_so(tmp_path):
+def test_a_movie_without_a_ball_is_reported(tmp_path):
     (look,) = look_at([no_ball(tmp_path)])
     assert look.diameter_px is None
     assert "no ball was found" in init(tmp_path / "empty.npy", "--out", tmp_path / "experiment.yaml")
@@ -244,7 +244,7 @@ def test_fictrac_is_taken_over(clean, tmp_path):
     assert mask[10, 10] == 255
 
 
-def test_a_camera_of_fictrac_wants_a_movie_of_the_set_up_and_is_the_source_of_live(clean, tmp_path):
+def test_a_camera_of_fictrac_needs_a_movie_of_the_set_up_and_is_the_source_of_live(clean, tmp_path):
     movie, _ = two_movies(clean, tmp_path)
     config, out = tmp_path / "config.txt", tmp_path / "experiment.yaml"
     config.write_text(CONFIG.replace("src_fn           : cam1.mkv", "src_fn           : 2"))
@@ -452,7 +452,7 @@ def test_a_draft_that_an_editor_changed_is_known_as_that_of_init(tmp_path, chang
         init(movie, "--out", out)
 
 
-def test_a_rate_that_fictrac_does_not_give_is_said(tmp_path):
+def test_a_rate_that_fictrac_does_not_give_is_reported(tmp_path):
     config, text = tmp_path / "config.txt", CONFIG.replace("cam1.mkv", no_ball(tmp_path).name)
     config.write_text(text)
     more = ("--from-fictrac", config, "--out", tmp_path / "experiment.yaml")

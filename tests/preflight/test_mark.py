@@ -110,7 +110,7 @@ def test_a_key_of_several_lines_is_left_alone(marking):
     assert marking.path.read_text() == text
 
 
-def test_the_server_answers_who_knows_the_token(marking, address):
+def test_the_server_answers_requests_with_the_token(marking, address):
     mine = f"{address}/{marking.token}"
     assert ask(f"{mine}/")[0] == 200
     assert json.loads(ask(f"{mine}/state")[1])["cameras"][0]["frames"] == 64
@@ -133,14 +133,14 @@ def test_the_map_is_laid_on_the_ball_as_it_lies_there(marking):
     assert np.corrcoef(picture[..., 0][inside], shown[inside])[0, 1] > 0.6
 
 
-def test_without_a_map_it_says_how_to_learn_one(marking):
+def test_without_a_map_it_prints_how_to_learn_one(marking):
     marking.experiment.texture_path.unlink()
     with pytest.raises(ExperimentError, match="learn it: `sphereorient map"):
         marking.rendered("cam1")
 
 
 @pytest.mark.parametrize("path", ["/", "/state", "/wrong/state", "/{token}", "/{token}/nothing", "/{token}/../state"])
-def test_others_get_nothing(marking, address, path):
+def test_requests_without_the_token_get_nothing(marking, address, path):
     assert ask(address + path.format(token=marking.token))[0] == 404
 
 

@@ -207,7 +207,7 @@ def test_rows_are_read_in_order_with_gaps_where_there_is_no_picture():
     assert read == [3, 4, 5, None, None, 8, 20, None, None, 30]
 
 
-def test_a_telecentric_camera_expects_its_own_scale():
+def test_a_telecentric_camera_expects_a_disk_at_its_own_scale():
     camera = TelecentricCamera(
         image_size=(300, 300),
         scale_mm_px=f64(0.25),
@@ -245,7 +245,7 @@ def scans_of(best: dict[str, float]) -> list[OffsetScan]:
     ],
     ids=["the last", "the first", "one that is early"],
 )
-def test_of_three_movies_the_one_out_of_step_is_named(late, start):
+def test_the_one_of_three_movies_out_of_step_is_named(late, start):
     found = in_step(scans_of(late), {})
     assert found.severity is FAULT
     wrong = {"cam3: 1}": "cam3", "cam1: 1,": "cam1"}
@@ -253,5 +253,5 @@ def test_of_three_movies_the_one_out_of_step_is_named(late, start):
     assert found.advice == start
 
 
-def test_three_movies_in_step_are_left_in_peace():
+def test_three_movies_in_step_get_no_finding():
     assert in_step(scans_of({"cam1": 0.0, "cam2": 0.03, "cam3": -0.02}), {}).severity is OK

@@ -148,7 +148,7 @@ def test_a_fixed_ball_is_better_off_with_pictures_without_it(clean, tmp_path):
     assert of(without, "ball cam1").severity is OK
 
 
-def test_a_ball_in_its_place_that_nobody_finds_is_looked_for_where_the_mask_shows_it(clean, tmp_path):
+def test_a_fixed_ball_that_is_not_found_is_searched_where_the_mask_shows_it(clean, tmp_path):
     path = write(
         clean, tmp_path, backgrounds=None, masks={"cam1": "mask.png"}, sphere={"diameter": 18.0, "fixed": True}
     )

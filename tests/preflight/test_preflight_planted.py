@@ -129,7 +129,7 @@ def test_a_wrong_diameter_is_found_and_the_right_one_named(clean, tmp_path, wron
 
 
 @pytest.mark.slow
-def test_one_wrong_focal_length_is_laid_to_its_camera(clean, tmp_path):
+def test_a_wrong_focal_length_is_found_in_its_own_camera(clean, tmp_path):
     path = write(clean, tmp_path)
     document = yaml.safe_load((tmp_path / "cameras.yaml").read_text())
     document["cameras"]["cam2"]["f"] *= 1.1

@@ -122,7 +122,7 @@ def test_a_map_of_one_colour_is_refused(clean, tmp_path):
 
 
 @pytest.mark.slow
-def test_of_a_map_of_nearly_one_colour_nothing_else_is_said(clean, tmp_path):
+def test_a_map_of_nearly_one_colour_has_no_other_finding(clean, tmp_path):
     faint = replace(clean, texture=(128 + clean.texture // 128).astype(np.uint8))
     result = checked(faint, tmp_path, sphere=PAINTED)
     assert of(result, "paint").severity is FAULT

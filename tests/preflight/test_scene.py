@@ -92,7 +92,7 @@ def test_exchanged_diameters_or_maps_are_reported_of_both_balls():
     assert found["a"].advice == "the diameters, or the textures, of a and b are exchanged: correct `spheres`"
 
 
-def test_a_disk_elsewhere_says_nothing_of_a_ball():
+def test_a_disk_elsewhere_gives_no_size_of_a_ball():
     assert size_findings({"a": 0.0}, {30.0: 18.0}, a=14.0) == {}
 
 

@@ -77,7 +77,7 @@ def test_what_was_not_measured_is_nan(table):
     assert table["cam1_reason"].tolist() == ["ok"] * 40
 
 
-def test_the_csv_begins_with_what_the_track_says_of_itself(track, tmp_path):
+def test_the_csv_begins_with_the_metadata_of_the_track(track, tmp_path):
     export_track(track, tmp_path / "t.csv", "csv")
     head = [line for line in (tmp_path / "t.csv").read_text().splitlines() if line.startswith("#")]
     assert head[:2] == ["# made by sphereorient", "# experiment: of May"]
@@ -87,7 +87,7 @@ def test_the_csv_begins_with_what_the_track_says_of_itself(track, tmp_path):
     assert "#     b: 1.0e-3  # why" in head
 
 
-def test_parquet_keeps_nan_apart_from_nothing_and_says_units(track, tmp_path):
+def test_parquet_keeps_nan_apart_from_nothing_and_names_units(track, tmp_path):
     export_track(track, tmp_path / "t.parquet", "parquet")
     table = arrow_parquet.read_table(tmp_path / "t.parquet")
     assert all(table[name].null_count == 0 for name in table.column_names)

@@ -62,7 +62,7 @@ def test_many_gaps_do_not_hide_a_spike():
     assert 3 in said(choose_worst(track, 2))
 
 
-def test_of_a_run_of_one_flag_the_lowest_score_is_shown():
+def test_the_lowest_score_of_a_run_of_one_flag_is_shown():
     track = changed(true_track(), slice(12, 19), flags=Flag.DOUBTFUL_FIT)
     track = camera_changed(track, "cam1", 16, score=0.9)
     assert list(choose_worst(track, 1)) == [16]

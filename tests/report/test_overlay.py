@@ -222,7 +222,7 @@ def test_frames_of_doubt_are_marked(ready):
     assert "not valid" in lost.balls[0].state(K)[0]
 
 
-def test_a_camera_that_by_itself_sees_the_ball_elsewhere_is_shown(ready):
+def test_a_camera_that_alone_measures_another_pose_is_shown(ready):
     page, pictures = ready
     whole = page.balls[0].track
     centre = whole.cameras["cam1"].centre_px[K]

@@ -237,7 +237,7 @@ def note_of(figure: Figure) -> str:
 
 
 @every_figure
-def test_every_axis_says_its_unit(name):
+def test_every_axis_names_its_unit(name):
     figure = FIGURES[name]()
     assert figure.axes
     for axes in figure.axes:
@@ -433,7 +433,7 @@ def test_frames_that_are_not_valid_are_shaded():
     assert not [c for c in plots.track_figure(planted_track()).axes[0].collections if c.get_label() == "not valid"]
 
 
-def test_of_a_long_track_the_best_part_of_the_longest_segment_is_shown_and_named():
+def test_the_best_part_of_the_longest_segment_of_a_long_track_is_shown_and_named():
     """Segments of 1000, 5000 and 3000 frames; of the longest, all but frames 3500 to 5499 are half lost."""
     track = planted_track(9000, cameras=())
     segment = np.repeat([0, 1, 2], [1000, 5000, 3000])

@@ -76,14 +76,14 @@ def test_a_folder_with_other_things_in_it_is_left_alone(place, report, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_a_file_in_place_of_a_folder_is_said_before_any_work(place, report, tmp_path):
+def test_a_file_in_place_of_a_folder_is_refused_before_any_work(place, report, tmp_path):
     code, _, said = report(place / "precise.h5", "--out", place / "precise.h5" / "page")
     assert code == 2
     assert "a folder to write in" in said
 
 
 @pytest.mark.slow
-def test_one_segment_has_a_page_and_a_line_that_says_what_is_missing(place, report, tmp_path):
+def test_one_segment_has_a_page_and_a_line_on_what_is_missing(place, report, tmp_path):
     code, out, said = report(place / "one.h5", "--out", tmp_path / "page", "--quiet")
     assert code == 0
     assert out == ""

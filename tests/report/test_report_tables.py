@@ -98,7 +98,7 @@ def test_what_was_lost_and_what_the_flow_is(written):
     assert flow["(nu^3 / epsilon)^(1/4)"] == pytest.approx(1e-6**0.75)
 
 
-def test_of_one_segment_only_what_needs_no_interval(tracked):
+def test_a_single_segment_gives_only_numbers_without_an_interval(tracked):
     first = tracked.at(np.flatnonzero(tracked.segment == tracked.segment[np.argmax(np.bincount(tracked.segment))]))
     one = first.at(np.flatnonzero(first.segment == np.bincount(first.segment).argmax()))
     found = tables_of(summarise(one, StatisticsSettings(min_frames=10)), {"one": one}, [])

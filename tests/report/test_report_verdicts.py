@@ -125,7 +125,7 @@ def test_rates_without_errors_are_named(lab):
     assert found.words.startswith("the errors of omega_lab are unknown")
 
 
-def test_of_one_segment_it_is_said_what_to_do(lab):
+def test_a_single_segment_gets_advice(lab):
     one = lab.at(np.flatnonzero(lab.segment == np.bincount(lab.segment).argmax()))
     found = said(one)
     assert found["Segments"].grade == "doubt"

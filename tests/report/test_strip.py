@@ -84,7 +84,7 @@ def test_frames_without_a_ball_are_neither_doubtful_nor_lost():
     assert track.summary()["lost"] == {"cam1": {"not_found": 3}, "cam2": {}}
 
 
-def test_the_strip_says_of_every_frame_what_was_planted():
+def test_the_strip_shows_of_every_frame_what_was_planted():
     track = camera_changed(troubled(), "cam1", 5, score=0.6)
     track = camera_changed(track, "cam1", 7, orientation=TURN)
     strip = strip_of(track)
@@ -193,7 +193,7 @@ def test_the_page_has_no_number_that_json_lacks_and_a_row_a_stretch():
     assert "cam1: too dark (20); cam2: no clear outline (10); the orientation jumps (1)" in page
 
 
-def test_style_and_script_ask_for_nothing_from_elsewhere():
+def test_style_and_script_load_nothing_from_elsewhere():
     for text in strip_assets():
         assert len(text) > 1000
         assert not re.search(r"https?:|@import|url\(|fetch\(|</", text)
@@ -222,7 +222,7 @@ def test_pictures_are_of_the_bad_frames_and_of_good_ones_between():
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 500])
-def test_there_are_not_more_pictures_than_asked_and_the_first_is_of_the_worst(count):
+def test_there_are_not_more_pictures_than_given_by_the_option_and_the_first_is_of_the_worst(count):
     why = chosen_frames(lost_excerpt(), count)
     assert len(why) == min(count, 40)
     assert not count or 20 <= next(iter(why)) < 28

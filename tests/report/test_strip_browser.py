@@ -87,7 +87,7 @@ def test_a_click_on_a_stretch_shows_a_frame_of_it_and_its_picture(open_page, pag
         assert part.locator(".strip__nearest").inner_text() == f"Picture of frame {number}:"
 
 
-def test_arrow_keys_step_by_one_and_say_which_picture_is_nearest(open_page, page_path):
+def test_arrow_keys_step_by_one_and_the_nearest_picture_is_named(open_page, page_path):
     with open_page(page_path) as page:
         part = section(page, "excerpt")
         part.locator("tr").nth(1).click()

@@ -105,7 +105,7 @@ def test_a_damaged_part_is_reported_and_measured_again_by_the_next_run(whole, tm
 
 
 @pytest.mark.slow
-def test_what_was_learnt_measures_the_same_again(whole, tmp_path, request_of):
+def test_a_kept_appearance_measures_the_same_again(whole, tmp_path, request_of):
     again = request_of(tmp_path, learnt=whole / "learnt.h5")
     tracked(again)
     assert datasets(again.out) == datasets(whole / "track.h5")

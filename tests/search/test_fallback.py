@@ -54,7 +54,7 @@ FIRST = {1: [(0.0, 0.9), (50.0, 0.5)], 2: [(10.0, 0.6), (90.0, 0.5)], 3: []}
 SECOND = {2: [(-60.0, 0.7), (85.0, 0.2)], 3: [(120.0, 0.4)], 1: [(170.0, 1.0)]}
 
 
-def test_the_second_is_asked_about_doubtful_disks_alone() -> None:
+def test_the_second_gets_doubtful_disks_alone() -> None:
     first, second = Planted(FIRST), Planted(SECOND)
     found = FallbackProposer(first, second, sure=0.75).propose(disks(1, 2, 3, 1))
     assert first.asked == [1, 2, 3, 1]
@@ -71,13 +71,13 @@ def test_in_doubt_the_second_comes_first_and_nothing_comes_twice() -> None:
 
 
 @pytest.mark.parametrize(("sure", "asked"), [(0.0, []), (0.61, [2, 3]), (1.0, [1, 2, 3])])
-def test_how_sure_the_first_must_be(sure: float, asked: list[int]) -> None:
+def test_the_threshold_of_the_first_counts(sure: float, asked: list[int]) -> None:
     second = Planted(SECOND)
     FallbackProposer(Planted(FIRST), second, sure=sure).propose(disks(1, 2, 3))
     assert second.asked == asked
 
 
-def test_a_disk_that_neither_knows_has_the_reason_of_the_second() -> None:
+def test_a_disk_without_a_proposal_of_either_has_the_reason_of_the_second() -> None:
     found = FallbackProposer(Planted({}), Planted({}), sure=0.75).propose(disks(1, 2))
     assert found.offset.tolist() == [0, 0, 0]
     assert found.reason == (Reason.LOW_SCORE,) * 2

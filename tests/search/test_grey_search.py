@@ -69,7 +69,7 @@ def test_one_pixel_of_80_off_is_found():
 
 
 @pytest.mark.slow
-def test_a_near_camera_sees_less_of_the_ball_and_says_so_by_its_distance():
+def test_a_near_camera_sees_less_of_the_ball_and_its_distance_is_given():
     R_view_body = attitudes(10)
     texture = reduced_texture(texture_of("blobs"), SIZE)
     disks = 20 + 150 * perspective_view(SIZE, 4.0).render(texture, R_view_body.float())
@@ -224,7 +224,7 @@ def test_every_rotation_lies_within_the_grids_covering_angle_of_a_template():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_of_each_attitude_a_peak_of_the_bank_lies_within_the_covering_angle(kind):
+def test_a_peak_of_the_bank_lies_within_the_covering_angle_of_each_attitude(kind):
     search, R_view_body = grey_search_of(kind), attitudes(60, seed=2)
     place, peak = search.search(camera_disks(kind, R_view_body))
     distance = apart_deg(search.templates[place].double(), R_view_body[:, None])

@@ -302,7 +302,7 @@ def test_no_proposal_scores_below_score_min_and_those_above_stay():
     assert torch.equal(few.score, all_of_them.score[all_of_them.score >= 0.8])
 
 
-def test_a_disk_whose_best_is_below_score_min_says_so():
+def test_a_disk_whose_best_is_below_score_min_has_the_reason_low_score():
     search = TemplateBank(texture_of("blobs"), SIZE, OrientSettings(score_min=1.0))
     found = search.propose(clean_disks("blobs", attitudes(2)))
     assert found.reason == (Reason.LOW_SCORE,) * 2

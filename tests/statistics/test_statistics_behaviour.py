@@ -90,7 +90,7 @@ def test_the_interval_holds_the_gain(exact):
     assert (np.mean(held, axis=0) > 0.85).all()
 
 
-def test_of_another_trackers_noise_the_gain_is_free_where_ours_is_as_large_and_lies_in_the_bounds():
+def test_the_gain_is_free_of_another_trackers_noise_where_ours_is_as_large_and_lies_in_the_bounds():
     rng, turns = np.random.default_rng(3), turns_of(4000)
     ours, theirs = (moved(errors(4000, rng, 0.0, 8e-3), turned(turns * g)) for g in ([1.0, 0.97, 1.0], [1.0, 1.0, 1.0]))
     found = compared(ours, theirs, exact=False)
@@ -130,7 +130,7 @@ def test_a_drift_beyond_a_half_turn_is_unwrapped():
     np.testing.assert_allclose(found.drift_deg_min, [0.0, np.rad2deg(6.0), 0.0], atol=10.0)
 
 
-def test_alignment_takes_off_a_constant_turn_of_the_lab_and_only_where_it_is_asked_for():
+def test_alignment_removes_a_constant_rotation_of_the_lab_and_only_by_its_option():
     turns = turns_of(600)
     ours, theirs = turned(turns * [1.0, 0.97, 1.0]) @ BODY, turned(turns)
     found = compared(ours, LAB @ theirs, align=True, exact=False)  # axes of the track

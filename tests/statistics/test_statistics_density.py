@@ -70,7 +70,7 @@ def test_the_fit_agrees_with_a_search_on_the_exact_likelihood():
 
 
 @pytest.mark.slow
-def test_its_intervals_hold_the_planted_width_as_often_as_they_say():
+def test_its_intervals_hold_the_planted_width_as_often_as_stated():
     held = 0
     for seed in range(100):
         fit = fit_stretched(planted(0.6, 6000, seed), np.arange(6000) // 60, 100, FEW)

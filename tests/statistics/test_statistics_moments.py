@@ -47,7 +47,7 @@ def test_equal_samples_within_a_segment_widen_the_interval_as_if_they_were_one()
 
 
 @pytest.mark.slow
-def test_intervals_of_a_skewed_mean_hold_it_as_often_as_they_say():
+def test_intervals_of_a_skewed_mean_hold_it_as_often_as_stated():
     rng = np.random.default_rng(4)
     held = 0
     for _ in range(400):

@@ -13,7 +13,7 @@ def calibrated(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return probability, rng.random(count) < probability
 
 
-def test_what_comes_as_often_as_said_has_an_error_of_chance_alone():
+def test_outcomes_as_frequent_as_stated_have_an_error_of_chance_alone():
     curve = reliability(*calibrated(20_000))
     assert curve.error < 2 * curve.chance < 0.02
     inside = (curve.low <= curve.probability) & (curve.probability <= curve.high)

@@ -110,7 +110,7 @@ def test_long_segments_are_cut_into_equal_pieces():
     assert (found.span_s <= 201 * STEP_S).all()
 
 
-def test_of_one_segment_an_ensemble_only_where_it_is_asked_for():
+def test_an_ensemble_of_one_segment_only_by_its_option():
     with pytest.raises(TrackError, match=r"two segments.*got 1.*max_duration_s"):
         ensemble_of(track([60]))
     assert ensemble_of(track([60]), fewest=1).segments == 1

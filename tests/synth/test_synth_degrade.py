@@ -93,7 +93,7 @@ def test_what_is_no_picture_is_refused():
 
 
 @pytest.mark.slow
-def test_the_page_is_what_the_table_says():
+def test_the_page_is_that_of_the_table():
     run = [sys.executable, REPO / "scripts" / "figure_degradations.py", "--check"]
     subprocess.run(run, check=True)
     text = (REPO / "docs" / "degradations.md").read_text()
@@ -285,7 +285,7 @@ def test_bubbles_are_as_many_as_said_before_the_disk():
 
 
 @pytest.mark.parametrize("radius", [2.0, 7.0])
-def test_dirt_covers_what_its_radius_says(radius):
+def test_dirt_covers_the_area_of_its_radius(radius):
     many = flat(200.0).expand(40, SIZE, SIZE)
     got = degrade(many, disk((40,)), {"dirt": radius}, seeded())
     # Middles scattered at random: a place stays clean with the probability of no middle within the radius.

@@ -159,7 +159,7 @@ def test_the_optics_blur_the_light_of_the_ball(name, tmp_path):  # the other ord
 
 
 @pytest.mark.slow
-def test_what_passes_by_moves_and_is_not_in_the_picture_without_the_ball(plain, tmp_path):
+def test_bubbles_move_and_are_not_in_the_picture_without_the_ball(plain, tmp_path):
     for name in ("occlusion", "bubbles"):
         path = write_degraded(tmp_path / name, SETTINGS, {name: 5})
         assert (empty_of(path) == 15).all()

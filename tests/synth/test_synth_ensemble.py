@@ -56,7 +56,7 @@ def test_true_moments_are_the_nominal_ones_in_both_frames(frame):
 
 
 @pytest.mark.parametrize("frame", ["lab", "body"])
-def test_orientations_turn_as_omega_says(frame):
+def test_orientations_rotate_by_omega(frame):
     true = draw_ensemble(EnsembleSpec(segments=5, mean_frames=80, frame=frame, frame_rate_hz=6000.0), 5)
     omega, _ = omega_from_orientations(
         torch.from_numpy(true.orientation), 1 / 6000, (1,), segment=torch.from_numpy(true.segment)
@@ -67,7 +67,7 @@ def test_orientations_turn_as_omega_says(frame):
     np.testing.assert_allclose(np.einsum("nij,nj->ni", true.orientation, true.alpha_body), true.alpha_lab, atol=1e-6)
 
 
-def test_positions_move_as_the_velocity_says():
+def test_positions_move_by_the_velocity():
     true = draw_ensemble(EnsembleSpec(segments=3), 6)
     one = true.segment == 1
     moved = np.gradient(true.position[one], 1 / 600, axis=0)[1:-1] * 1e-3

@@ -120,7 +120,7 @@ def test_maps_of_an_unworn_ball_show_no_wear_however_noisy():
 
 
 @pytest.mark.slow
-def test_what_a_map_does_not_know_is_neither_worn_nor_healed():
+def test_unseen_paint_is_neither_worn_nor_healed():
     blind = torch.where(near(FIRST_SPOT, 25.0), torch.nan, paint())
     worn = torch.where(planted(3), 0.7, paint())
     series = wear_series([paint(), worn, blind, worn], turned=False)

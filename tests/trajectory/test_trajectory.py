@@ -94,7 +94,7 @@ def test_what_was_not_measured_is_nan_and_outside_any_segment() -> None:
     assert set(track.cameras["cam1"].reason) == {"not_found"}
 
 
-def test_every_dataset_says_its_units_and_what_it_is(tmp_path: Path) -> None:
+def test_every_dataset_has_its_units_and_a_description(tmp_path: Path) -> None:
     full_trajectory().save(tmp_path / "track.h5")
     with h5py.File(tmp_path / "track.h5") as file:
         silent: list[str] = []

@@ -95,7 +95,7 @@ def test_paint_of_twice_the_size_has_half_the_border_and_takes_twice_the_brush(k
 @pytest.mark.parametrize(
     ("kind", "size", "got"), [("stripes", 10.0, "'stripes'"), ("dots", 0.1, "0.1"), ("dots", math.nan, "nan")]
 )
-def test_paint_that_nobody_knows_is_refused(kind, size, got):
+def test_an_unknown_kind_or_size_of_paint_is_refused(kind, size, got):
     with pytest.raises(PaintError, match=got):
         patterned_texture(kind, size, 0)
 
@@ -122,7 +122,7 @@ def test_views_that_are_near_each_other_are_not_counted_as_alike():
 
 
 @pytest.mark.slow
-def test_the_judgement_is_that_of_the_bound_and_knows_the_view_without_paint():
+def test_the_judgement_is_that_of_the_bound_and_finds_the_view_without_paint():
     # Dots on one half only: the other half's middle is white, and nothing can be said there.
     direction = map_directions(128)
     texture = patterned_texture("dots", 15.0, 1, 128)
