@@ -1,4 +1,4 @@
-"""The docs say what is: examples run, tables are those of the code, tests named in them exist."""
+"""The docs are right: examples run, tables are those of the code, tests named in them exist."""
 
 import contextlib
 import doctest
@@ -223,7 +223,7 @@ def test_the_files_of_the_walkthrough_load(tmp_path):
 
 
 def cells(line: str) -> str:
-    """The words of a printed line, without the borders of tables and however it is spaced."""
+    """The words of a printed line, without borders of tables and spaces."""
     return " ".join(re.sub("[│┃|]", " ", line).split())
 
 
@@ -271,7 +271,7 @@ def test_every_command_of_a_page_exists_with_its_options_and_settings(page):
 
 @pytest.mark.parametrize("page", DOCS, ids=lambda path: path.name)
 def test_every_file_of_the_project_that_a_page_names_exists(page):
-    if page.name == "CHANGELOG.md":  # names what was
+    if page.name == "CHANGELOG.md":  # names the past
         return
     rooms = "|".join(path.parent.name for path in (REPO / "sphereorient").glob("*/__init__.py"))
     text = page.read_text()

@@ -1,4 +1,4 @@
-"""Mistakes at the toolkit's edge: each is refused in one line that says what was expected, what came and what to do."""
+"""Mistakes at the toolkit's edge: each is refused in one line: expected, got, do."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Each tutorial runs from its first line to its last; what it states is asserted in it."""
+"""Each tutorial runs from its first line to its last and asserts its own statements."""
 
 import os
 import re

@@ -32,7 +32,7 @@ def turning(frames: int, deg_per_frame: float = 1.2) -> Tensor:
 
 
 def turned_deg(R: Tensor, *degrees: float) -> Tensor:
-    """R turned on by a rotation vector in lab components."""
+    """R rotated further by a rotation vector in lab components."""
     return so3.exp(torch.deg2rad(torch.tensor(degrees, dtype=R.dtype))) @ R
 
 

@@ -1,4 +1,4 @@
-"""Balls that look alike keep their names by their motion; where that cannot be known, it is said."""
+"""Balls that look alike keep their names by their motion; frames where names are uncertain are marked."""
 
 from __future__ import annotations
 

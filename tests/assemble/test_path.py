@@ -1,4 +1,4 @@
-"""One camera's path: planted truths are recovered, holes skipped, poor candidates kept out; docs/errata.md A6."""
+"""One camera's path: planted truths are recovered, gaps skipped, poor candidates left out; docs/errata.md A6."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ def test_a_stuck_candidate_that_is_the_only_one_for_a_while_is_skipped_and_not_f
     shown[60 : 60 + length] = seen(standing(length), rng)
     path = physical_path(pooled(shown), times(120), SETTINGS)
     assert lost_frames(path) == list(range(60, 60 + length))
-    assert path.segment.tolist() == [0] * 120  # the motion goes on behind it
+    assert path.segment.tolist() == [0] * 120  # the motion goes on after it
     assert flagged(path, Flag.RECOVERED) == [60 + length]
     assert not flagged(path, Flag.SPIKE)
 
@@ -125,7 +125,7 @@ def test_false_candidates_beside_the_truth_behind_a_hole_are_not_taken(rng):
     mask = torch.ones(100, 2, dtype=torch.bool)
     mask[50:62] = False
     path = physical_path(pooled(seen(near, rng), seen(R, rng), mask=mask, nll=[0.0, 0.0]), times(100), SETTINGS)
-    assert len(path.choice[path.present].unique()) == 1  # whichever: it is the same one before and behind
+    assert len(path.choice[path.present].unique()) == 1  # either one, but the same before and after
 
 
 def test_both_cameras_blind_for_twenty_frames_end_a_segment_and_the_next_begins_at_once(rng):
@@ -241,7 +241,7 @@ def test_single_candidates_are_left_as_they_are(deg_per_frame, rng):
 
 
 def crowded(rng: torch.Generator, frames: int = 60) -> tuple[Hypotheses, torch.Tensor]:
-    """The truth in a random place among false ones, here and there absent; scores that help a little."""
+    """The truth in a random place among false ones, missing in some frames; scores help a little."""
     R = turning(frames, 6.0)
     every = so3.random_rotations((frames, 4), generator=rng)
     mask = torch.rand(frames, 4, generator=rng) < 0.8

@@ -1,4 +1,4 @@
-"""The soft path of both orders: against all paths, its derivatives, its limits, and where nothing goes."""
+"""The soft path of both orders: against all paths, its derivatives, its limits, and movies without a path."""
 
 from __future__ import annotations
 

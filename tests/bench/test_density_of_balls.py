@@ -49,7 +49,7 @@ def write_truth(path: Path, names: str, apart_mm: float = 30.0) -> dict[str, dic
 
 
 def tracks_of(truth: dict[str, dict[str, np.ndarray]], named: dict[str, str]) -> Tracks:
-    """Tracks that say what is true of other balls: `named` holds the ball that is meant by a name."""
+    """Tracks with the true poses of other balls: `named` holds the ball behind each name."""
     time_s = next(iter(truth.values()))["time"]
     empty = Trajectory.empty(time_s, cameras=("cam1",), frame_rate=600.0, method="precise")
     empty = replace(empty, valid=np.ones(FRAMES, bool))
@@ -125,7 +125,7 @@ def test_a_scene_has_as_many_balls_cameras_and_paints_as_its_plan(tmp_path):
 
 
 def test_each_ball_of_a_scene_is_measured_and_alike_ones_by_the_names_of_the_truth(tmp_path):
-    """Balls a and c wear one paint and come exchanged; b, of another paint, is taken for a in three frames."""
+    """Balls a and c have the same paint and are exchanged; b, of another paint, is taken for a in three frames."""
     (scene,) = scenes_of(BenchSettings(degradations=(), seeds=(0,), balls=3, paints=2, frames=FRAMES))
     truth = write_truth(tmp_path / "truth.h5", "abc")
     write_experiment(tmp_path, scene)

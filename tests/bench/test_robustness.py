@@ -124,7 +124,7 @@ def test_the_row_of_a_table_is_that_of_its_frames(truth):
     assert line.wrong_after == pytest.approx(2 / 48)
     assert line.lost == pytest.approx(1 / 48)
     assert line.inside == pytest.approx(44 / 47)
-    assert line.over_stated == one.over_stated  # the other one states none: of an older version
+    assert line.over_stated == one.over_stated  # the other one, of an older version, has none
     assert line.wrong_before == pytest.approx((6 + 48) / (24 + 48))
     assert line.frames_per_s == pytest.approx(48 / 3)
 

@@ -29,7 +29,7 @@ def truth() -> dict[str, np.ndarray]:
 
 
 def perfect(truth: dict[str, np.ndarray], frames: slice = slice(None)) -> Trajectory:
-    """A track that says what is true."""
+    """A track with the true poses."""
     time = truth["time"][frames]
     track = Trajectory.empty(time, cameras=("cam1", "cam2"), frame_rate=600.0, method="paper", experiment="excerpt")
     known = {key: truth[key][frames] for key in ("position", "orientation", *RATES)}

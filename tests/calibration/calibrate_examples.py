@@ -36,7 +36,7 @@ ALONE = {(4, "cam2")}  # pictures that were not taken
 
 @dataclass(frozen=True, kw_only=True)
 class Posed(Scene):
-    """A plate in any place before the camera."""
+    """A plate at any position before the camera."""
 
     R: Tensor = field(default_factory=lambda: torch.eye(3).double())
     T: Tensor = field(default_factory=lambda: AT)
@@ -91,7 +91,7 @@ def pictures() -> Mapping[str, NDArray[np.uint8]]:
 
 
 def document() -> dict[str, Any]:
-    """What calibration.yaml says."""
+    """Content of calibration.yaml."""
     entries = []
     for row in range(len(POSES)):
         names = {name: f"{name}_{row:02}.png" for name in ("cam1", "cam2") if (row, name) not in ALONE}

@@ -13,7 +13,7 @@ WALLS = {name: port(name) for name in ("cam1", "cam2")}
 
 
 def errors_in_sigmas(fitted, rig):
-    """What is missing to the truth, whitened by the joint covariance of all cameras."""
+    """Error of the cameras, whitened by the joint covariance of all."""
     parts = []
     for name, camera in fitted.rig.cameras.items():
         names = camera.covariance.names
@@ -92,7 +92,7 @@ def test_a_parameter_that_nothing_determines_gets_a_huge_sigma(rng):
 def test_covariances_cover_the_errors_of_200_calibrations(rng):
     rig, squares = planted(rng, count=5), []
     for _ in range(200):
-        fitted = adjust(problem(rig, views(rig, rng)))  # begins at the truth: the fit forgets where it began
+        fitted = adjust(problem(rig, views(rig, rng)))  # begins at the truth: the result does not depend on the start
         squares.append(errors_in_sigmas(fitted, rig).square())
     squares = torch.stack(squares)
     assert 0.93 < float(squares.mean().sqrt()) < 1.07

@@ -1,4 +1,4 @@
-"""Cameras that contradict each other: planted faults are found and named; cameras that agree are left in peace."""
+"""Cameras that contradict each other: planted faults are found and named; cameras that agree get no finding."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ OTHERS = [("cam1", 0), ("cam1", 2), ("cam2", 0), ("cam2", 1), ("cam2", 2)]  # ca
 def seen_by(
     cameras: dict[str, Camera], frames: int = 40, diameter_mm: float = MM, seed: int = 1, noise: float = 1.0
 ) -> Seen:
-    """Return what cameras see of a moving sphere, with the noise of fits in unkind light."""
+    """Return the views of a moving sphere, with the noise of fits in poor light."""
     settings = SynthSettings(frames=frames, seed=seed)
     motion = motion_of(settings).at(frame_times_s(settings))
     rng = torch.Generator().manual_seed(seed)

@@ -39,7 +39,7 @@ def track_of(
         cameras[name] = replace(
             track.cameras[name],
             centre_px=(camera.project(X) + off).numpy(),
-            # The middle of two sights of equal error is known to 1e-3 mm.
+            # The middle of two lines of sight of equal error has an error of 1e-3 mm.
             centre_sigma_px=math.sqrt(2) * 1e-3 * radius_px / (MM / 2),
             radius_px=radius_px,
             orientation=(turn @ R).numpy(),
@@ -182,7 +182,7 @@ def test_a_frame_without_a_place_keeps_the_errors_of_its_orientation():
         (Reason.LOW_SCORE, 300.0, None, True),
         (Reason.NOT_FOUND, 300.0, None, True),
         (Reason.OUTLINE, 300.0, np.ones((650, 650), bool), True),
-        (Reason.OUTLINE, 300.0, np.zeros((650, 650), bool), False),  # hidden by what stands there always
+        (Reason.OUTLINE, 300.0, np.zeros((650, 650), bool), False),  # under the mask
         (Reason.LOW_SCORE, 30.0, None, False),  # the edge cuts the disk
         (Reason.LOW_SCORE, 615.0, None, False),
         (Reason.LOW_SCORE, math.nan, None, False),

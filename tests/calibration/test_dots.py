@@ -1,4 +1,4 @@
-"""Dots in pictures: all that are whole, none that are cut, to a few hundredths of a pixel."""
+"""Dots in pictures: all whole ones, no cut ones, to a few hundredths of a pixel."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sphereorient.errors import CameraError, ShapeError
 
 
 def against_truth(dots: Dots, scene: Scene) -> tuple[set[tuple[int, int]], np.ndarray]:
-    """Return which dots were found, and by how much each misses, less the perspective bias."""
+    """Return the found dots and the error of each, less the perspective bias."""
     index = scene.plate.indices
     points, diameter = torch.from_numpy(scene.plate.points(index)), torch.from_numpy(scene.plate.diameters(index))
     shift = disk_centre_shift(scene.camera, scene.R_lab_plate, scene.T_lab_plate, points, diameter).numpy()

@@ -59,7 +59,7 @@ def test_a_guess_behind_a_wall_finds_focal_length_and_place_of_the_camera_in_air
 
 
 def test_a_camera_that_looks_aslant_through_its_wall_looks_more_aslant_in_air(rng):
-    """By Snell: 12 degrees in air are 8.8 in the liquid, which is what a camera without wall would be turned by."""
+    """By Snell: 12 degrees in air are 8.8 in the liquid, by which a camera without wall would be rotated."""
     aslant = so3.exp(torch.deg2rad(vector(12.0, 0.0, 0.0)))
     true = cameras(walls=True, turned_deg=0.0)["cam1"]
     R = aslant @ true.camera.R_cam_lab

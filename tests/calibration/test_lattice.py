@@ -20,7 +20,7 @@ from sphereorient.errors import CameraError
 
 
 def dots_at(scene: Scene, *, without: tuple[tuple[int, int], ...] = (), jitter_px: float = 0.0, seed: int = 0) -> Dots:
-    """Dots as `find_dots` would give them, by the projection alone: cheap, for many poses."""
+    """Dots as from `find_dots`, by projection alone: quick, for many poses."""
     keep = np.array([tuple(at) in scene.whole() and tuple(at) not in without for at in scene.plate.indices.tolist()])
     index = scene.plate.indices[keep]
     step = 0.5 * scene.plate.diameters(index)[:, None] / scene.plate.pitch_mm
@@ -139,7 +139,7 @@ def test_a_plate_without_its_fiducials_in_view_floats_and_the_true_place_is_amon
 def test_fiducials_hidden_on_a_whole_plate_are_where_dots_are_missing_and_replaced_ones_fit_nowhere() -> None:
     scene = Scene(tilt_deg=30)
     view = see_plate(scene.picture(without=PLATE.fiducials), PLATE)
-    # The other way round small dots would be where fiducials belong.
+    # With the axes exchanged, small dots would be where fiducials belong.
     assert_indexed_right(view, scene, 96)
     small = see_plate(scene.picture(small=PLATE.fiducials), PLATE)
     assert small.state == "refused"
@@ -167,7 +167,7 @@ def test_a_plate_with_more_dots_than_stated_is_refused(columns: int, rows: int) 
 
 @pytest.mark.slow
 def test_dots_that_stick_out_on_one_side_are_refused_although_their_number_fits() -> None:
-    # 11 x 9 stated, seen is a part of a 15 x 9 plate: 11 columns, but reaching to column 7.
+    # 11 x 9 stated, but the picture shows a part of a 15 x 9 plate: 11 columns, but reaching to column 7.
     large = replace(PLATE, columns=15)
     scene = Scene(plate=large, tilt_deg=20, at_mm=(-34.0, 0.0), distance_mm=230)
     columns = {i for i, _ in scene.whole()}
@@ -279,7 +279,7 @@ def clicks(scene: Scene, *index: tuple[int, int], off_px: float = 3.0) -> np.nda
     return scene.centres_px(np.array(index)) + np.array([off_px, -off_px])
 
 
-# Covered on both halves, so that the gaps do not give them away.
+# Covered on both halves, so that the gaps do not show them.
 BADLY_SEEN = {"small": PLATE.fiducials, "without": (*PLATE.fiducials, (-3, 0), (0, -2))}
 
 
@@ -293,7 +293,7 @@ def test_clicked_fiducials_tie_a_picture_in_which_they_are_too_small_or_covered(
     view = index_dots(dots, PLATE, clicked=clicks(scene, *PLATE.fiducials[:count]))
     assert_indexed_right(view, scene, len(scene.whole(0.15)) - len(BADLY_SEEN[badly]))
     assert not PLATE.is_fiducial(view.index).any()  # a dot that is too small is not measured as a fiducial
-    # A click names a dot: how far beside it does not matter, and no centre moves.
+    # A click names a dot: its distance does not matter, and no centre moves.
     other = index_dots(dots, PLATE, clicked=clicks(scene, *PLATE.fiducials[:count], off_px=-5.0))
     assert np.array_equal(other.uv_px, view.uv_px)
     assert np.array_equal(other.index, view.index)

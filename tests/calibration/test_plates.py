@@ -178,7 +178,7 @@ def test_no_fiducials_in_any_picture_of_a_camera_is_refused(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("columns", "rows"), [(7, 7), (31, 9)])
 def test_a_grid_of_another_size_is_refused_or_does_no_harm(source, tmp_path, columns, rows):
-    """Smaller than what is seen: refused. Larger: the rest may lie outside the picture, the dots are where they are."""
+    """A smaller plate than seen is refused. A larger one may lie partly outside the picture; the dots stay."""
     plate = document()["plate"] | {"columns": columns, "rows": rows}
     path = write(tmp_path, {"plate": plate})
     if columns < 11:

@@ -20,14 +20,14 @@ NOISE_PX, NOISE_DEG = 0.03, 0.08
 
 
 def observations(calibrated, truly, rng, frames=FRAMES, noise=1.0, bias_deg=0.0):
-    """What cameras of a calibration say of a ball that cameras `truly` filmed: its picture's centre, its attitude."""
+    """Centres and attitudes of a ball by cameras `calibrated`, from pictures that cameras `truly` filmed."""
     places = 45 * (2 * torch.rand(frames, 3, generator=rng, dtype=torch.float64) - 1)
     R_lab_body = so3.exp(2 * torch.randn(frames, 3, generator=rng, dtype=torch.float64))
     centres, attitudes = [], []
     for k, (name, camera) in enumerate(calibrated.items()):
         true = truly[name]
         centre = true.project(places) + noise * NOISE_PX * torch.randn(frames, 2, generator=rng, dtype=torch.float64)
-        # The picture fixes the ball before the camera; the calibration says what that is in the lab.
+        # The picture gives the pose before the camera; the calibration takes it to the lab.
         turn = frame(camera, centre) @ frame(true, true.project(places)).mT
         wobble = torch.deg2rad(noise * NOISE_DEG * torch.randn(frames, 3, generator=rng, dtype=torch.float64))
         bias = torch.deg2rad(bias_deg * k * vector(0.6, -0.3, 0.7))
@@ -40,7 +40,7 @@ def observations(calibrated, truly, rng, frames=FRAMES, noise=1.0, bias_deg=0.0)
 
 
 def frame(camera, uv_px):
-    """Axes in the lab of what a camera sees at pixels: the line of sight, and two across it."""
+    """Axes at pixels of a camera, in the lab: the line of sight, and two across it."""
     forward = camera.rays(uv_px).direction_lab
     down = camera.rays(uv_px + vector(0.0, 1.0)).direction_lab - camera.rays(uv_px - vector(0.0, 1.0)).direction_lab
     down = torch.nn.functional.normalize(down - (down * forward).sum(-1, keepdim=True) * forward, dim=-1)
@@ -48,13 +48,13 @@ def frame(camera, uv_px):
 
 
 def relative_deg(found, true):
-    """By how much the turn between the cameras is wrong, degrees."""
+    """Error of the rotation between the cameras, degrees."""
     between = [rig["cam2"].R_cam_lab @ rig["cam1"].R_cam_lab.mT for rig in (found, true)]
     return float(torch.rad2deg(so3.geodesic_distance(*between)))
 
 
 def bump(rng):
-    """0.3 degrees and 0.5 mm, in a direction of chance."""
+    """0.3 degrees and 0.5 mm, in a random direction."""
     turn, move = (torch.nn.functional.normalize(torch.randn(3, generator=rng).double(), dim=0) for _ in range(2))
     return torch.deg2rad(torch.tensor(0.3)).double() * turn, 0.5 * move
 
@@ -98,7 +98,7 @@ def test_cameras_that_stand_right_stay(rng):
 
 @pytest.mark.slow
 def test_parameters_that_the_sphere_does_not_determine_are_named(rng):
-    """How far the second camera stands away along its own axis: its lines of sight hardly move."""
+    """A distance along the second camera's own axis hardly moves its lines of sight."""
     calibrated = cameras()
     truly = calibrated | {"cam2": bumped(calibrated["cam2"], *bump(rng))}
     result = self_calibrate(observations(calibrated, truly, rng))

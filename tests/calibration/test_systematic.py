@@ -30,7 +30,7 @@ def draws(known, count, rng):
 
 
 def wrong_cameras(rig, known, draw):
-    """The true cameras, where those of the calibration are wrong by a draw."""
+    """The true cameras: those of the calibration, changed by a draw."""
     made = {}
     for name, camera in rig.items():
         own = [k for k, label in enumerate(known.names) if label.startswith(f"{name}.")]
@@ -71,7 +71,7 @@ class Ball:
         self.slope = torch.stack([(self.shown(rig, h) - self.shown(rig, -h)) / 2e-5 for h in steps], dim=-1)
 
     def shown(self, some, pose):
-        """What cameras show of a ball turned and moved: paint, and of the limb its distance from the middle."""
+        """Pictures of a ball rotated and moved: paint, and the limb's distance from the middle."""
         parts = []
         for name, camera in some.items():
             turned = self.paint[name] @ so3.exp(pose[:3]).mT + self.place + pose[3:]
@@ -81,7 +81,7 @@ class Ball:
         return torch.cat(parts)
 
     def error(self, truly):
-        """The small error (6,) of the pose found, where the cameras truly are others: what takes it to the truth."""
+        """The small error (6,) of the pose found with wrong cameras: from it to the truth."""
         pose = torch.zeros(6, dtype=torch.float64)
         seen = self.shown(truly, pose)
         for _ in range(3):
@@ -129,7 +129,7 @@ def test_a_turn_of_both_cameras_turns_the_ball_and_its_place(rng):
 
 
 def test_between_the_frames_that_are_computed_a_quadratic_gives_the_same(rng):
-    """Of many frames some are computed; of as few as here all."""
+    """With many frames some are computed; with as few as here all."""
     rig, known = cameras(), covariance(rng)
     places = 40 * (2 * torch.rand(400, 3, generator=rng, dtype=torch.float64) - 1)
     direct = systematic_errors(rig, known, places[:100], RADIUS)

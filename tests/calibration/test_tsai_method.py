@@ -1,4 +1,4 @@
-"""Tsai's calibration: planted cameras come back, OpenCV agrees, and what cannot be known is refused."""
+"""Tsai's calibration: planted cameras come back, OpenCV agrees, and undetermined parameters are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verdict of a calibration: structured residuals, dropped points, lenses beyond belief, and a wall left out."""
+"""The verdict of a calibration: structured residuals, dropped points, impossible lenses, and a wall left out."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from sphereorient.errors import CameraError
 
 
 def fitted(missed_px, used=None, **lens):
-    """A calibration of one camera whose plates are missed by (pictures, dots, 2)."""
+    """A calibration of one camera with residuals (pictures, dots, 2), px."""
     index, reports = PLATE.indices, []
     for row, missed in enumerate(missed_px):
         view = seen_points(PLATE, index, 20.0 * index + 320.0, np.full(len(index), 0.03))
@@ -57,7 +57,7 @@ def test_noise_is_no_structure():
     for seed in range(40):
         assert doubts(fitted(noise(seed=seed))) == {}
     assert doubts(fitted(noise(3))) == {}
-    assert doubts(fitted(structure(0.008))) == {}  # too small to matter
+    assert doubts(fitted(structure(0.008))) == {}  # too small for a finding
 
 
 @pytest.mark.parametrize("size_px", [0.03, 0.1])
@@ -99,7 +99,7 @@ def calibrated(monkeypatch, seen, known):
 
 
 def rig_and_views(walls, seed=3, model="tsai"):
-    """What cameras see that look a little aslant at their walls, as in ../shared/tank."""
+    """Views of cameras that look a little aslant at their walls, as in ../shared/tank."""
     rng = torch.Generator().manual_seed(seed)
     rig = replace(planted(rng, model, count=10), cameras=cameras(model, walls, turned_deg=5.0))
     return rig, views(rig, rng)

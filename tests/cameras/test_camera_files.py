@@ -1,4 +1,4 @@
-"""Camera files of other programs: read as those programs project, named where a key is not used, refused by cause."""
+"""Camera files of other programs: read as those programs project; unused keys named, faults refused by cause."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small changes of named parameters: what the names mean, and the covariance in them."""
+"""Small changes of named parameters: the meaning of the names, and the covariance of the parameters."""
 
 from __future__ import annotations
 

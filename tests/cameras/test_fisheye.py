@@ -1,4 +1,4 @@
-"""The fisheye camera: OpenCV's `fisheye` model, up to what lies behind the camera."""
+"""The fisheye camera: OpenCV's `fisheye` model, also behind the camera."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def test_faults_of_the_file_are_one_line(tmp_path, keys, message):
 
 
 def opencv_text(**changed: str) -> str:
-    """Return what OpenCV's sample, or ROS, writes."""
+    """Return a file as OpenCV's sample, or ROS, writes it."""
     whole = {"image_width": "640", "image_height": "480"} | changed
     lines = [f"{key}: {value}" for key, value in whole.items()]
     for key, shape, data in (

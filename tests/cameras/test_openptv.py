@@ -19,7 +19,7 @@ from sphereorient.cameras.brown import OpenPTVCamera
 from sphereorient.cameras.io.openptv import PtvPar, load_openptv, load_ptv_par
 from sphereorient.errors import CameraError
 
-# The layout that OpenPTV writes: centre, angles, matrix (which nobody reads), shift and distance, glass vector.
+# The layout that OpenPTV writes: centre, angles, matrix (not read), shift and distance, glass vector.
 ORI = """  105.26320000 102.74580000 403.88220000
     -0.23832910   0.24428100   0.05525770
 
@@ -153,7 +153,7 @@ def test_the_glass_vector_and_the_media_become_a_port(tmp_path):
     camera = load_openptv(ori, load_ptv_par(par), addpar)
     assert isinstance(camera, PortCamera)
     assert_close(camera.port.normal, f64((0.0001, 0.00001, 150.0)) / 150, atol=1e-9)
-    # Snell's law knows ratios only: 1.25 : 1.5 is 1 : 1.2.
+    # Snell's law depends on ratios only: 1.25 : 1.5 is 1 : 1.2.
     numbers = [camera.port.offset_mm, camera.port.thickness_mm, camera.port.n_glass, camera.port.n_fluid]
     assert_close(torch.stack(numbers), f64((150.0, 6.0, 1.2, 1.2)), atol=1e-9)
     uv_px = whole_picture((1280, 1024), steps=3)

@@ -34,7 +34,7 @@ def bumped(calibrated):
 
 
 def track_of(calibrated, truly, contradicts=0):
-    """What a track made with `calibrated` says of a ball that cameras `truly` filmed."""
+    """The track, made with `calibrated`, of a ball that cameras `truly` filmed."""
     rng = torch.Generator().manual_seed(6)
     places = 20 * (2 * torch.rand(FRAMES, 3, generator=rng).double() - 1)
     R = so3.exp(2 * torch.randn(FRAMES, 3, generator=rng).double())

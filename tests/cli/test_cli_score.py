@@ -68,7 +68,7 @@ def test_the_errors_of_a_track_are_printed(track):
 
 
 def test_a_constant_turn_of_the_body_axes_is_named_and_taken_off(track):
-    """As of a learnt map: errors of 150 degrees, and one rotation explains them."""
+    """As with a learnt map: errors of 150 degrees, explained by one rotation."""
     loaded, turn = Trajectory.load(track), Rotation.from_rotvec([2.0, 1.5, -0.8]).as_matrix()
     with h5py.File(TRUTH) as file:
         rates = {key: file[key][()] for key in ("omega_lab", "omega_body", "alpha_body") if key in file}
@@ -156,7 +156,7 @@ TURN = Rotation.from_euler("xyz", [0.3, -0.5, 0.8]).as_matrix()
 
 @pytest.fixture
 def on_a_ball(tmp_path: Path) -> Trajectory:
-    """The track of a ball in its place, 200 frames, whose turns about y are too small by 3 %; its truth and FicTrac's
+    """The track of a fixed ball, 200 frames, whose rotations about y are too small by 3 %; its truth and FicTrac's
     table, in other axes, beside it.
     """
     rng = np.random.default_rng(4)
@@ -209,7 +209,7 @@ def test_the_gain_against_truth_another_track_and_fictracs_table_is_that_of_the_
 
 
 def test_the_table_that_is_exported_of_a_track_is_that_track(on_a_ball, tmp_path):
-    """Its counter begins at 0, as FicTrac's: from 1 on each frame was compared with the one beside it."""
+    """Its counter begins at 0, as FicTrac's. Before: it began at 1, and each frame was compared with the next one."""
     table = fictrac_table(on_a_ball, FicTracAxes.of_lab(TURN))
     np.savetxt(tmp_path / "own.dat", table, delimiter=", ")
     found = scored(tmp_path / "track.h5", tmp_path / "own.dat", "--align", "both")

@@ -1,4 +1,4 @@
-"""What is uploaded: the wheel and the source distribution, used in an environment of their own."""
+"""The wheel and the source distribution, used in an environment of their own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`doctor`: what it says of a machine that is in order, and of ones where something is broken."""
+"""`doctor` on a machine in order, and on machines with a fault."""
 
 from __future__ import annotations
 

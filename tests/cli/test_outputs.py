@@ -1,4 +1,4 @@
-"""What the commands write over, and what they say where memory is short."""
+"""Files that the commands replace, and their message where memory is short."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def place(tmp_path) -> Path:
     (folder / "marked.yaml").write_text(text.replace("texture.png", "marked.png"))
     true_track().save(folder / "track.h5")
     for path in folder.iterdir():
-        os.utime(path, (1, 1))  # no longer as this process left it
+        os.utime(path, (1, 1))  # changed since this process wrote it
     return folder
 
 

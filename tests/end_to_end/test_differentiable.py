@@ -104,7 +104,7 @@ def chain(scene: Scene, theta: Tensor, iterations: int = 20) -> tuple[SoftTrack,
     off = so3.exp(f64([[0.02, -0.01, 0.02], [-0.01, 0.02, 0.01], [0.25, -0.3, 0.5]]))
     start = (off @ scene.R_lab_body[:, None]).flatten(0, 1)
     place = scene.position_lab_mm.repeat_interleave(3, 0)
-    place[3 * EMPTY] = torch.nan  # nothing is known of an empty frame
+    place[3 * EMPTY] = torch.nan  # an empty frame has no position
     use = there.repeat_interleave(3)
     fit = implicit_pose(residual, start, place, use=use, iterations=iterations)
     track = soft_track(
@@ -154,7 +154,7 @@ def test_the_chain_is_what_it_should_be(scene):
     with torch.no_grad():
         track, picture = chain(scene, f64([0.0, 0.0, 0.0]))
     there = torch.arange(FRAMES) != EMPTY
-    # Noise is all that is left; each camera's candidate has its share, and the false one has none.
+    # Only noise is left; each camera's candidate has its share, and the false one has none.
     assert 0.9 < picture.square().mean().sqrt() < 1.1
     assert so3.geodesic_distance(track.R_lab_body, scene.R_lab_body)[there].max() < 0.02
     assert (track.marginals[there][:, :2] > 0.1).all()

@@ -48,7 +48,7 @@ def check(row: dict[str, Any], frames: int = 96) -> None:
     assert row["good_lost"] == 0
     assert row["reasons_elsewhere"] == 0
     assert row["worst_deg"] < most_worse(row["fault"]) * row["clean_worst_deg"]
-    assert row["same"]  # with what the clean run had learnt: the same bits in all blocks without the fault
+    assert row["same"]  # with the appearance of the clean run: the same bits in all blocks without the fault
 
 
 @pytest.mark.slow
@@ -93,7 +93,7 @@ def test_a_ball_half_out_of_view_is_measured_as_well_as_its_half_allows(everythi
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["30 % of each camera black", "30 % of each camera lost, stamps"])
 def test_a_third_of_the_frames_lost_costs_those_frames(everything, name):
-    """Nine in a hundred instants nobody saw; all others are measured."""
+    """No camera saw nine in a hundred instants; all others are measured."""
     row = everything[name]
     seen_by_none = row["frames"] - row["valid"]
     assert row["good_lost"] == 0

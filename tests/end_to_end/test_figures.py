@@ -10,7 +10,7 @@ import kept
 import pytest
 from conftest import REPO
 
-# Pages whose tables hold numbers that nobody measured: formats, sources, settings' meanings, lists of findings.
+# Pages whose tables hold numbers that were not measured: formats, sources, settings' meanings, lists of findings.
 NOT_MEASURED = {
     "check.md", "data-format.md", "export.md", "model.md", "movies.md", "parameters.md", "degradations.md"
 }  # fmt: skip

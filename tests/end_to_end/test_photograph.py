@@ -1,4 +1,4 @@
-"""One photograph as input: from `init` to a track, against the truth of a rendered still; and what is refused."""
+"""One photograph as input: from `init` to a track, against the truth of a rendered picture; and refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The precise method from movies to track, on movies with exact truth: what can go wrong, and is found out."""
+"""The precise method from movies to track, on movies with exact truth: faults are found and marked."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ def test_after_a_gap_of_12_frames_and_44_degrees_the_track_goes_on(brisk, tmp_pa
     check_nothing(track, gap)
     assert np.flatnonzero(track.flags & Flag.RECOVERED).tolist() == [first + 12]
     assert np.flatnonzero(track.flags & Flag.EXTRAPOLATED).tolist() == gap.tolist()
-    # One motion, so the smoother fills the gap, and knows how well.
+    # One motion, so the smoother fills the gap, with its covariance.
     assert set(track.segment) == {0}
     assert angle_deg(track.orientation_smooth, brisk.R_lab_body)[gap].max() < 1.0
     sigma = np.sqrt(np.trace(track.orientation_smooth_cov, axis1=1, axis2=2))
@@ -213,7 +213,7 @@ def test_when_one_camera_is_blind_the_other_goes_on_and_the_flag_is_set(brisk, t
     reasons = track.cameras[name].reason
     assert {reasons[k] for k in blind} <= {Reason.NOT_FOUND, Reason.LOW_SCORE}
     assert {reasons[k] for k in rest(brisk, blind)} == {Reason.OK}
-    # The distance is known from the size alone: less well, and the covariance says how much.
+    # The distance comes from the size alone: its error is larger, and the covariance states it.
     sigma = np.sqrt(np.diagonal(track.position_cov, axis1=1, axis2=2))
     across = [axis for axis in range(3) if axis != along]
     assert np.median(sigma[blind][:, along]) > 8 * np.median(sigma[blind][:, across])
@@ -266,14 +266,14 @@ def test_frames_of_another_attitude_do_not_draw_the_track_away(held, tmp_path):
     movies = held.frames(np.r_[0:30, 90:93, 33:80, 105, 81:90])
     spliced = np.array([30, 31, 32, 80])
     track = followed(movies, tmp_path, lost=spliced)
-    # What the pictures show there may pass for a measurement or for a fault, but not for a smooth motion.
+    # These pictures may pass for a measurement or for a fault, but not for a smooth motion.
     off = turned_off(track, movies)[spliced]
     assert (np.isnan(off) | (off < 0.4)).all()
     assert (~track.valid[spliced] | (track.flags[spliced] & (Flag.SPIKE | Flag.RECOVERED | Flag.AMBIGUOUS) > 0)).all()
 
 
 def with_more_noise(movie: np.ndarray) -> np.ndarray:
-    """Make each picture one of its own: a camera never takes the same twice, and who sees that takes it for a fault."""
+    """Make each picture different: a repeated picture counts as a fault."""
     more = np.random.default_rng(4).integers(0, 3, movie.shape, dtype=np.uint8)
     return np.clip(movie.astype(np.int16) + more - 1, 0, 255).astype(np.uint8)
 
@@ -345,7 +345,7 @@ def test_the_blur_of_soft_pictures_is_learnt_and_a_given_one_is_used(brisk, tmp_
 
 @pytest.mark.slow
 def test_a_mirrored_map_is_refused_of_soft_pictures_too(brisk, tmp_path):
-    """Any pose explains most of a blurred disk: what counts is how much more the best one does."""
+    """Any pose explains most of a blurred disk: only the surplus of the best one counts."""
     path = write(soft(brisk.frames(slice(0, 40)), 0.14 * 25.0), tmp_path)
     texture = path.with_name("texture.png")
     cv2.imwrite(str(texture), np.ascontiguousarray(cv2.imread(str(texture), cv2.IMREAD_GRAYSCALE)[:, ::-1]))
@@ -384,7 +384,7 @@ def test_movies_of_a_few_frames_are_tracked(short, tmp_path, count):
     if count == 1:
         assert np.isnan(track.omega_lab).all()
         assert np.isnan(track.velocity).all()
-    # What there is of derivatives is not nonsense: 4.5 degrees a frame are 47 rad/s.
+    # The few derivatives are right: 4.5 degrees a frame are 47 rad/s.
     assert not (np.abs(track.omega_lab) > 300).any()
 
 
@@ -438,7 +438,7 @@ def test_two_runs_give_the_same_bytes_with_one_thread_or_two(short, tmp_path):
 
 @pytest.mark.slow
 def test_what_a_block_measures_does_not_depend_on_the_blocks_beside_it(short, tmp_path, monkeypatch):
-    """Chunks, workers and a run begun again at a block are all this: windows of other blocks."""
+    """Chunks, workers and a resumed run are all windows of other blocks."""
     made: list[BallTracker] = []
 
     class Kept(BallTracker):
@@ -476,7 +476,7 @@ def _digest(poses: Poses) -> str:
 
 @pytest.mark.slow
 def test_frames_of_the_first_blocks_do_not_depend_on_how_the_movie_is_decoded(short, tmp_path):
-    """The same pictures from FFV1 and from .npy, whichever thread read them."""
+    """The same pictures from FFV1 and from .npy, read by any thread."""
     from_npy = track_movies(write(short, tmp_path))
     from_video = track_movies(short.folder / "experiment.yaml")
     for name in ("position", "orientation", "orientation_cov", "omega_lab", "segment", "flags", "confidence"):

@@ -1,4 +1,4 @@
-"""The script that redoes the paper: its movies move as stated, it refuses what it cannot use, and the page is whole."""
+"""The script that redoes the paper: its movies move as stated, unusable ones are refused, and the page is whole."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def test_the_paper_runs_nothing_of_what_its_key_leaves_out():
             ran.add(frame.f_code.co_filename)
 
     experiment = load_experiment(REPO / "synthetic_data" / "excerpt" / "experiment.yaml")
-    track_movies(replace(experiment, frames=(0, 12)), method="paper")  # what runs at imports does not count
+    track_movies(replace(experiment, frames=(0, 12)), method="paper")  # code that runs at imports does not count
     threading.setprofile(look)
     sys.setprofile(look)
     try:

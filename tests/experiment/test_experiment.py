@@ -1,4 +1,4 @@
-"""experiment.yaml: what it says, what it refuses, and how movies, cameras and times come together."""
+"""experiment.yaml: its meaning, its refusals, and how movies, cameras and times come together."""
 
 from __future__ import annotations
 

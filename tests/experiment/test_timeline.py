@@ -1,4 +1,4 @@
-"""Which frame is when, and which picture of each movie shows it."""
+"""Time of each frame, and the picture of each movie that shows it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def line(folder: Path, text: str) -> Timeline:
 
 
 def save_stamped(path: Path, time_s: list[float]) -> None:
-    """A movie whose frames say their own number, with stamps."""
+    """A movie whose frames hold their own number, with stamps."""
     with h5py.File(path, "w") as file:
         file["frames"] = np.arange(len(time_s), dtype=np.uint8)[:, None, None] * np.ones((1, 6, 8), np.uint8)
         file["time"] = np.asarray(time_s)
@@ -60,7 +60,7 @@ def test_a_movie_that_ends_early_has_no_pictures_of_the_last_frames_and_a_remark
     assert frames.rows["cam2"].tolist() == list(range(15))
     assert len(frames.remarks) == 1
     assert "cam1.npy: no pictures of frames 12 to 14" in frames.remarks[0]
-    assert not line(folder, BOTH + "frames: [0, 12]\n").remarks  # nothing asked for is lacking
+    assert not line(folder, BOTH + "frames: [0, 12]\n").remarks  # all requested frames exist
 
 
 def test_frames_beyond_all_movies_are_refused(folder):

@@ -1,4 +1,4 @@
-"""What runs keep: the same arrays, or made again; never a wrong one, and no fault of the folder ends a run."""
+"""Kept arrays are the same or made again; never wrong; no fault of the folder ends a run."""
 
 from __future__ import annotations
 

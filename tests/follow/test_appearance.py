@@ -1,4 +1,4 @@
-"""What is learnt of the cameras' agreement before frames are followed."""
+"""The usual disagreement of the cameras, learnt before tracking."""
 
 from __future__ import annotations
 

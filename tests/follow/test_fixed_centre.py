@@ -1,4 +1,4 @@
-"""A ball that turns in its place: one place for all frames, found from a few, held in all, its error not forgotten."""
+"""A fixed ball: one position for all frames, found from a few, held in all, with its error."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_attitudes_err_with_the_position_as_follows_states():
     follows = follows_place(Held(), pixels, X[0], R, use)
     firm = 1e14 * torch.eye(3, dtype=torch.float64).expand(4, 3, 3)
     for aside in f64([[0.05, 0.0, 0.0], [0.0, 0.0, 0.05]]):
-        # Held at the true place + aside, the place errs by -aside: true less measured, as delta is of the attitude.
+        # Held at the true position + aside, the error of the position is -aside: true less measured, as for delta.
         error = turn_errors(held(X + aside, R, firm), R) - turn_errors(held(X, R, firm), R)
         assert_close(error.median(0).values, -follows @ aside, 0.1 * float((follows @ aside).norm()))
 
@@ -116,7 +116,7 @@ def truth(path: Path) -> tuple[Tensor, Tensor]:
 
 
 def beside(fitter: Fitter, frames: Sequence[Frame], pose: Poses, place: FixedCentre, error_mm: Tensor) -> Tensor:
-    """Delta by which a frame's attitude is found to differ where the ball is held beside its place; brute force."""
+    """Delta of a frame's attitude where the ball is held beside its position; brute force."""
     fine, use = fitter.optics.fine, pose.use[None]
     pixels = fitter.pixels([[frame.picture for frame in frames]], place.position_lab_mm[None], fine)
     firm = 1e14 * torch.eye(3, dtype=torch.float64)[None]
@@ -192,7 +192,7 @@ def test_all_frames_are_measured_in_one_place_and_better(tmp_path_factory, camer
 
 
 def declared(folder: Path) -> tuple[Path, Path]:
-    """The same movie, as one of a ball that moves, and declared to be of one that does not."""
+    """Tracks of the same movie: of a moving ball, and declared fixed."""
     path = in_its_place(folder)
     document = yaml.safe_load(path.read_text())
     document["sphere"]["fixed"] = True

@@ -131,7 +131,7 @@ def test_a_map_of_another_ball_is_refused(still):
 
 
 def chosen_alone(odds_of_map, *others):
-    """What becomes of a frame alone with one pose of score 0.9, and others of these scores."""
+    """Outcome of a single frame with one pose of score 0.9, and others of these scores."""
     table = PoseTable(
         mask=torch.ones(1, 1 + len(others)).bool(),
         use=torch.ones(1, 1).bool(),

@@ -1,4 +1,4 @@
-"""The start of a frame of several balls: who is where, by paint, sights, size and motion."""
+"""The start of a frame of several balls: names by paint, lines of sight, size and motion."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def rotation(*rotvec):
 
 
 class Planted:
-    """A ball whose paint is known exactly: disks show the rotations of the planted balls that wear it."""
+    """A ball whose paint is known exactly: disks show the rotations of the planted balls that have it."""
 
     def __init__(self, paint, truth, worse=()):
         self.paint, self.truth, self.worse = paint, truth, worse

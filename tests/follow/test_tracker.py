@@ -1,4 +1,4 @@
-"""What the frames before say of the next one, and when two cameras disagree."""
+"""Prediction of the next frame from earlier ones, and disagreement of two cameras."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def test_cameras_disagree_where_their_own_turns_are_apart_by_more_than_usual_and
 
 
 def part(turn: float, cameras: int) -> Poses:
-    """What some cameras say of a ball, that is turned about x from where others see it."""
+    """Poses by some cameras, rotated about x from those of others."""
     whole = seen(0.0, 0.0)
     names = ("own_turn", "own_covariance", "own_move", "own_sigma_mm", "limb_coverage", "excess", "score")
     return replace(

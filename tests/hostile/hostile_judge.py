@@ -1,4 +1,4 @@
-"""What an answer to a hostile input is, and what is none: the one place that decides."""
+"""Judgement of the answers to hostile inputs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Load = Callable[[Path], Any]
 
 @dataclass(frozen=True)
 class Case:
-    """One hostile input: what it is called, what lies in the file, and what stands in the file's place."""
+    """One hostile input: its name, the content of its file, and what replaces the file."""
 
     name: str
     content: bytes = b""
@@ -71,7 +71,7 @@ PLACES = ("missing", "folder", "fifo", "device", "socket", "loop", "long name", 
 
 @dataclass
 class Tally:
-    """What became of the inputs of one family."""
+    """Results of one family."""
 
     refused: int = 0
     accepted: int = 0
@@ -81,7 +81,7 @@ class Tally:
     slowest: str = ""
 
     def judge(self, case: Case, load: Load, path: Path) -> None:
-        """Load one input, unless the same was loaded before, and note what came of it."""
+        """Load one input, unless the same was loaded before, and note the result."""
         if (case.place, case.content) in self.seen:
             return
         self.seen.add((case.place, case.content))
@@ -117,7 +117,7 @@ class Tally:
 def _wrong_with(message: str, path: Path) -> str:
     if len(message.splitlines()) != 1 or any(unicodedata.category(letter) in ("Cc", "Cs") for letter in message):
         return f"not one line without controls: {message[:200]!r}"
-    # Where the hostile file names another one, by an absolute path, the fault may lie there.
+    # Where the hostile file names another one by an absolute path, the fault may be there.
     if path.name not in message and str(path.parent) not in message and not message.startswith("/"):
         return f"does not name the file: {message[:200]}"
     if len(message.replace(str(path.parent), "")) > LONGEST + (len(path.name) if len(path.name) > 255 else 0):
@@ -126,7 +126,7 @@ def _wrong_with(message: str, path: Path) -> str:
 
 
 class Hang(Exception):
-    """The load took longer than anybody waits."""
+    """The load took too long."""
 
 
 @contextmanager

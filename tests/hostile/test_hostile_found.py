@@ -1,4 +1,4 @@
-"""What hostile inputs once broke, one test a finding: each of these hung, crashed, filled the memory or lied."""
+"""Faults that hostile inputs once found, a test each: hangs, crashes, filled memory, wrong results."""
 
 from __future__ import annotations
 

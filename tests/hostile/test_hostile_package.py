@@ -16,7 +16,7 @@ YAML |= {"Loader", "UnsafeLoader", "FullLoader", "CLoader", "CUnsafeLoader", "CF
 
 
 def dangers(tree: ast.AST) -> list[str]:
-    """What of a file could run what another file says."""
+    """Places of a file that could run code from another file."""
     found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import | ast.ImportFrom):

@@ -1,4 +1,4 @@
-"""Checkpoints: what is written is read, and whatever else a file may be is refused in one line, nothing executed."""
+"""Checkpoints: written ones are read, and any other file is refused in one line, nothing executed."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_code_in_a_file_is_not_executed(tmp_path, form):
     assert not mark.exists()
     if form in ("torch", "in the weights"):
         assert "code" in text
-        torch.load(path, weights_only=False)  # that it would have done so otherwise
+        torch.load(path, weights_only=False)  # otherwise it would have done so
         assert mark.exists()
 
 

@@ -1,4 +1,4 @@
-"""`sphereorient train` and `evaluate`: files, words, and refusals of one line."""
+"""`sphereorient train` and `evaluate`: files, messages, and refusals of one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Training in small: it learns, the same seed gives the same weights, and what was cut off goes on as if it had not."""
+"""Training in small: it learns, the same seed gives the same weights, and a resumed training has the same result."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def rows_of(folder: Path) -> list[dict[str, float]]:
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> tuple[Trained, Path]:
-    """A hundred steps: eight seconds on one slow core. It gets better all the time, so the patience is not tried."""
+    """A hundred steps: eight seconds on one slow core. It gets better all the time, so `patience` has no effect."""
     folder = tmp_path_factory.mktemp("trained") / "proposer"
     return train_proposer(tiny(patience=1), folder), folder
 
@@ -194,7 +194,7 @@ def test_training_ends_when_validations_get_no_better(tmp_path):
 
 @pytest.mark.slow
 def test_weights_that_got_worse_are_not_kept(trained, tmp_path):
-    """A learning rate that throws away what was learnt: the best are those of the beginning."""
+    """A learning rate that destroys the weights: the best are those of the beginning."""
     start = trained[1] / "proposer.ckpt"
     result = train_proposer(tiny(epochs=1, steps=3, learning_rate=0.5, start=str(start)), tmp_path)
     assert result.rows[-1]["validation_nll"] > result.rows[0]["validation_nll"] + 0.1
@@ -226,7 +226,7 @@ def test_the_learning_rate_rises_and_falls(monkeypatch):
 
 @pytest.mark.slow
 def test_a_temperature_that_was_planted_is_found(rng):
-    """Logits of half the size want half the temperature, and with it probabilities are those of the outcomes."""
+    """Logits of half the size get half the temperature, and then probabilities are those of the outcomes."""
     grid = untrained().grid
     logits = 14.0 * torch.nn.functional.normalize(torch.randn(200, 9, generator=rng), dim=1) @ grid.flatten(1).T
     truth = grid[torch.multinomial(logits.softmax(1), 1, generator=rng)[:, 0]]

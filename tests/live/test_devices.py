@@ -1,4 +1,4 @@
-"""Cameras of makers and of OpenCV: one behaviour, whatever their drivers do."""
+"""Cameras of makers and of OpenCV behave alike with any driver."""
 
 import struct
 import sys
@@ -175,7 +175,7 @@ def test_a_camera_that_vanishes_is_reported_once_and_taken_up_again(maker, alone
     found = list(islice(frames, 3))
     frames.close()
     assert [int(one.pictures[0][0, 0]) for one in found] == [1, 2, 3]
-    assert all(a.time_s < b.time_s for a, b in pairwise(found)), "its clock began anew"
+    assert all(a.time_s < b.time_s for a, b in pairwise(found)), "its clock restarted"
     name = maker.replace("maker.cti#", "") + "4711"
     assert [line.split(";")[0] for line in messages] == [
         f"{name}: expected a working camera, got 'it was removed'",

@@ -33,7 +33,7 @@ def test_a_feed_that_waits_gives_all_frames_in_order():
 
 
 def test_a_frame_that_waits_for_the_tracking_arrives_when_it_is_taken():
-    """Frames of movie-fast are read ahead: the time in which they wait is no latency."""
+    """Frames of movie-fast are read ahead: their waiting time is no latency."""
     with open_recording(EXCERPT / "experiment.yaml") as recording:
         frames = iter(Feed(movie_frames(recording, paced=False), 4, wait=True))
         for _ in range(8):

@@ -301,7 +301,7 @@ def test_an_osc_reader_gets_a_message_a_frame_in_order():
 def stream():
     pytest.importorskip("pylsl", reason="the extra `live`")
     output = LslOutput(f"ball {os.getpid()}", pytest.fail)
-    output.send(numbers(-1))  # whoever listens knows it from the first frame on
+    output.send(numbers(-1))  # so that readers find the stream from the first frame on
     yield output
     output.close()
 
@@ -336,7 +336,7 @@ def test_an_lsl_reader_gets_all_samples_in_order_with_names_units_and_lsl_times(
 
     until(pulled)
     assert frames == list(range(LINES))
-    assert begun_s - 0.1 < stamps[0] < begun_s + LIMIT_S  # by LSL's clock, whatever that of the source
+    assert begun_s - 0.1 < stamps[0] < begun_s + LIMIT_S  # by LSL's clock, for any clock of the source
     reader.close_stream()
 
 

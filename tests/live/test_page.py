@@ -1,4 +1,4 @@
-"""The page of `live`: what it shows is what was measured; who may ask; and that it holds nothing up."""
+"""The page of `live` shows the measured poses, answers only requests with its token, and holds nothing up."""
 
 import base64
 import json
@@ -57,7 +57,7 @@ def poses():
 
 @dataclass
 class Shown:
-    """A page after some frames, and what the loop knows of it."""
+    """A page after some frames, and its state in the loop."""
 
     page: LivePage
     running: Event

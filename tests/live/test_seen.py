@@ -1,4 +1,4 @@
-"""Which cameras are seen: drivers that answer, hang, fail, end their program; modules stand for them."""
+"""List of cameras: drivers that answer, hang, fail or end their program, as modules in their place."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""A ring of poses in memory: read in order by another program, and who is slow sees what it lost."""
+"""A ring of poses in memory: read in order by another program; a slow reader finds which ones it lost."""
 
 import os
 import struct

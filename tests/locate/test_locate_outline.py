@@ -1,4 +1,4 @@
-"""The outline: planted disks come back to a fraction of a pixel, whatever is painted on them or stands beside them."""
+"""The outline: planted disks come back to a fraction of a pixel, for any paint and any object beside them."""
 
 import cv2
 import numpy as np
@@ -28,7 +28,7 @@ RADII = [39.0, 36.4]
 
 
 def sectors(count: int, turn: float = 0.0):
-    """White sectors; the others are as dark as what lies behind, so that they and their rim vanish."""
+    """White sectors; the others are as dark as the background, so that they and their rim vanish."""
 
     def paint(x, y):
         number = np.floor((np.arctan2(y, x) + turn) * count / (2 * np.pi))
@@ -85,7 +85,7 @@ def test_the_radius_of_a_ball_dimmer_at_its_rim_is_right(place, radius):
 
 @pytest.mark.parametrize("radius", RADII)
 def test_the_root_of_the_picture_makes_an_evenly_lit_disk_too_large_by_a_known_amount(radius):
-    """The known limit of edges in the root of the picture: it pays for the dim rim of a real ball, above."""
+    """The known limit of edges in the root of the picture, accepted for the dim rim of a real ball, above."""
     outline = outline_of(filmed(plant(white, *PLACES[0], radius)), *PLACES[0])
     assert 0.30 < outline.radius_px - radius < 0.45
 
@@ -160,7 +160,7 @@ def test_a_disk_that_the_border_cuts_is_as_wrong_as_its_spread_states(u, paint):
     scale = max(outline.rms_px, 0.2)  # the known error of the radius is no scatter
     assert error @ np.linalg.inv(outline.spread) @ error < 3 * (3 * scale) ** 2
     sigma = np.sqrt(np.diag(outline.spread))
-    assert sigma[0] > 1.5 * sigma[1]  # along the border it is known well
+    assert sigma[0] > 1.5 * sigma[1]  # along the border the error is small
 
 
 def wrinkled(depth, share):

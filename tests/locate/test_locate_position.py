@@ -1,4 +1,4 @@
-"""From outlines to the lab: exact centres give exact places, and the covariance is what noise really does."""
+"""From outlines to the lab: exact centres give exact positions, and the covariance is that of the noise."""
 
 from dataclasses import replace
 

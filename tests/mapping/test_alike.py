@@ -1,4 +1,4 @@
-"""Maps of balls that wear one paint are joined; those of other balls are left."""
+"""Maps of balls with the same paint are joined; maps of other balls stay."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""Several balls cut out of movies before there are maps: each by where it is."""
+"""Several balls cut out of movies before there are maps, by their positions."""
 
 from __future__ import annotations
 

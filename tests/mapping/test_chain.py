@@ -99,7 +99,7 @@ def test_a_pattern_of_the_sensor_does_not_pull_turns_towards_zero():
 
 @pytest.mark.parametrize("count", [6, 60])
 def test_paint_alone_is_not_taken_for_a_pattern_of_the_sensor(count):
-    """The plain mean over all instants holds paint: it takes 3 % off the turns of 60 clean pictures."""
+    """The plain mean over all instants holds paint: rotations of 60 clean pictures get 3 % too small."""
     R = tumbling(count, 4.0)
     disks = disks_of_pictures(pictures(R, 2, "dots"))
     taken = (without_static(disks, R).layers - disks.layers)[0, :, 0].square().mean()

@@ -50,7 +50,7 @@ def paint(normal_body: torch.Tensor) -> torch.Tensor:
 
 
 def picture_of(camera: Camera, R_lab_body: torch.Tensor) -> torch.Tensor:
-    """What a camera sees of that paint, (H, W) float32; 0 beside the ball."""
+    """A camera's picture of that paint, (H, W) float32; 0 beside the ball."""
     width, height = camera.image_size
     v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
     rays = camera.rays(torch.stack([u, v], dim=-1))

@@ -26,7 +26,7 @@ from sphereorient.trajectory import Trajectory
 
 
 def refused(monkeypatch, capsys, *arguments: object) -> str:
-    """Run what must be refused, and return the one line."""
+    """Run a command that must be refused, and return its line."""
     code, out, err = run(monkeypatch, capsys, *arguments, "--quiet")
     assert code == 2, out + err
     lines = err.strip().splitlines()
@@ -73,7 +73,7 @@ def test_a_map_is_learnt_written_and_tracked_with(rendered, tmp_path_factory, mo
         assert np.isnan(file["map/texture"][()]).sum() == (file["map/seen"][()] == 0).sum()
     assert np.percentile(attitude_errors_deg(scene / "learnt_map.h5", rendered), 95) < 1.0
     assert cv2.imread(str(scene / "learnt_map.png")).shape[1] > 500
-    # What `track` makes of it, the pictures anew, frame by frame.
+    # `track` by this map, frame by frame.
     shutil.copytree(rendered.parent, scene / "scene")
     shutil.copy(out, scene / "scene" / "learnt.png")
     rewrite(scene / "scene" / "experiment.yaml", texture="learnt.png")
@@ -218,4 +218,4 @@ def test_two_maps_are_compared_and_wear_is_drawn(tmp_path, monkeypatch, capsys):
     assert printed["changed_share"] < 0.01
     assert cv2.imread(str(tmp_path / "moved.png")).shape[1] > 500
     write_seen(torch.zeros(96, 192), tmp_path / "new.png")
-    assert run(monkeypatch, capsys, *arguments)[0] == 2  # nothing known in one of them: nothing to compare
+    assert run(monkeypatch, capsys, *arguments)[0] == 2  # one is all unseen: nothing to compare

@@ -30,7 +30,7 @@ def test_two_renders_give_the_rotation_without_a_map(cameras, within_deg):
 
 
 def test_paint_that_one_camera_shows_is_found_again_by_the_other():
-    # A quarter turn about lab y carries what camera 1 sees before camera 2.
+    # A quarter turn about lab y moves paint that camera 1 sees before camera 2.
     quarter = so3.exp(torch.tensor([0.0, math.pi / 2, 0.0], dtype=torch.float64))
     start = so3.exp(torch.tensor([0.2, 0.4, -0.3], dtype=torch.float64))
     R = torch.stack([start, quarter @ start])

@@ -1,4 +1,4 @@
-"""Instants that lost their place are found again; a ball in one place, half hidden, of unknown size, is measured."""
+"""Instants without a pose are recovered; a fixed ball, half hidden, of unknown size, is measured."""
 
 import math
 from dataclasses import replace
@@ -32,7 +32,7 @@ def truth_of(path: Path) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_instants_between_are_turned_as_their_neighbours_were():
-    """The chain leans by a drift that grows evenly; two instants are known, the third lies halfway."""
+    """The chain drifts evenly; two instants are known, the third lies halfway."""
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     true = so3.exp(torch.arange(5, dtype=torch.float64)[:, None] * torch.tensor([0.3, -0.1, 0.2], dtype=torch.float64))
     chain = so3.exp(-0.02 * torch.arange(5, dtype=torch.float64)[:, None] * axis) @ true
@@ -53,7 +53,7 @@ def test_instants_that_do_not_fit_are_found_again_and_the_others_stay(tmp_path):
     turn = torch.tensor([[0.5, 0.3, -0.2], [-0.4, 0.3, 0.5], [0.1, -0.7, 0.2], [0.6, 0.0, 0.4]], dtype=torch.float64)
     spoilt = state.R_lab_body.clone()
     spoilt[lost] = so3.exp(turn) @ spoilt[lost]
-    # A chain that leans by 3 degrees at the end, in a body frame of its own.
+    # A chain with a drift of 3 degrees at the end, in a body frame of its own.
     lean = torch.linspace(0, math.radians(3), len(R), dtype=torch.float64)[:, None] * torch.tensor([1.0, 0, 0]).double()
     chain = so3.exp(lean) @ R @ so3.exp(torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64))
     found = recovered(crops, replace(state, R_lab_body=spoilt), chain)

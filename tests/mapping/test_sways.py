@@ -1,4 +1,4 @@
-"""A ball that turns in its holder, and sways or sinks there: nothing is known before, and no scene is empty."""
+"""A ball that rotates, sways or sinks in its holder, without a map and without a frame of the empty scene."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -48,7 +48,7 @@ def swaying_scene(request, tmp_path_factory):
 
 
 def off(scene, position_lab_mm, true) -> np.ndarray:
-    """Return by how much places are off, (N, 3): to the right and down, px, and in size, of the radius."""
+    """Return errors of positions, (N, 3): to the right and down, px, and of the size, in radii."""
     view, radius_mm = scene.place.views[0], scene.place.radius_mm
     px = view.camera.project(position_lab_mm) - view.camera.project(true)
     sizes = [view.radius_px(X, radius_mm) for X in (position_lab_mm, true)]
@@ -118,6 +118,6 @@ def test_outliers_are_left_out_and_the_path_is_smoothed_by_its_own_noise():
     ]
     path = smoothed(sightings_of(found), LocateSettings())
     off = (np.column_stack([path.centre_px, path.radius_px]) - true)[:199]
-    assert not bool(path.placed[199])  # what lies beyond is not known
+    assert not bool(path.placed[199])  # no outline follows
     assert (off.std(0) < 0.15).all()
     assert np.abs(off[[30, 31, 60, 61, 120]]).max() < 0.4

@@ -1,4 +1,4 @@
-"""What a track says of frames that no other frame confirms, or that the others contradict."""
+"""Flags of frames that no other frame confirms, or that the others contradict."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ TURNED = 20  # frame
 
 
 def tracked(monkeypatch, change, **known):
-    """The excerpt, with its measured poses changed before they are joined, and what is known of its pictures."""
+    """The excerpt, with its measured poses changed before they are joined, and its appearance."""
     joined = precise.join_ball
 
     def changed(job, appearance, table):

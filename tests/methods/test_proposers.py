@@ -1,4 +1,4 @@
-"""The bank of a search shows what the nearest camera sees."""
+"""The bank of a search shows the view of the nearest camera."""
 
 import pytest
 import torch

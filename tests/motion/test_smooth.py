@@ -145,7 +145,7 @@ def test_slow_errors_are_covered_by_the_share_that_is_set_aside_for_them(rng: to
     settings = SmoothSettings(slow_share=share)
     found = [smoothed(truth, position, R, settings=s) for s in (settings, WHITE)]
     honest, bold = (over_sigma(truth.position_lab_mm - x.position_lab_mm, x.position_cov_mm2) for x in found)
-    assert 0.6 < honest < 1.4  # somewhat timid: the learnt factor holds part of the slow errors already
+    assert 0.6 < honest < 1.4  # somewhat too large: the learnt factor holds part of the slow errors already
     assert bold > 1.4
     assert torch.equal(found[0].position_lab_mm, found[1].position_lab_mm)
 

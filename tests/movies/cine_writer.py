@@ -22,7 +22,7 @@ class Bytes(bytearray):
 
 @dataclass
 class Cine:
-    """What to write; the defaults are a plain recording whose rows are stored bottom-up."""
+    """Content of the file; the defaults are a plain recording whose rows are stored bottom-up."""
 
     frames: NDArray[Any]  # (N, H, W) or (N, H, W, 3) in R, G, B, as they are to be seen
     first_number: int = 0
@@ -38,7 +38,7 @@ class Cine:
     blocks_after: Sequence[tuple[int, bytes]] = ()
     setup_length: int = SETUP_LENGTH
     real_bits: int = 0
-    compression: int = 0  # what the header says: 1: JPEG, 2: raw colours of a filter array
+    compression: int = 0  # of the header: 1: JPEG, 2: raw colours of a filter array
     packed_bits: int = 0  # 10 or 12
     gap: int = 0  # bytes between images that belong to none
     rotate: int = 0

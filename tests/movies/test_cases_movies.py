@@ -59,7 +59,7 @@ def test_a_phones_time_stamps_are_its_times(name, tick_s):
 @pytest.mark.parametrize("name", ["matlab73.h5", "matlab73.mat", "h5create.h5"])
 def test_matlabs_pictures_are_upright(name):
     movie = open_movie(CASES / "matlab_hdf5" / name)
-    if name == "h5create.h5":  # nothing marks it: it says so
+    if name == "h5create.h5":  # without a mark: remarked
         assert remarks(movie, "flip: transpose")
         movie = flipped(movie, "transpose")
     assert movie.frame_shape == (160, 200)
@@ -69,7 +69,7 @@ def test_matlabs_pictures_are_upright(name):
 @pytest.mark.parametrize("name", ["nhwc.h5", "nhwc.npy", "nchw.h5"])
 def test_a_fourth_axis_of_one_channel_is_read(name):
     movie = open_movie(CASES / "hdf5_four_axes" / name)
-    movie = flipped(movie, "transpose") if name == "nchw.h5" else movie  # (N, 1, W, H), which it says
+    movie = flipped(movie, "transpose") if name == "nchw.h5" else movie  # (N, 1, W, H), as marked
     assert (len(movie), movie.frame_shape) == (24, (160, 200))
     assert middle(movie) == pytest.approx((120, 70), abs=1.5)
 

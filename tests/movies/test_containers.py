@@ -1,4 +1,4 @@
-"""What containers say beside the pictures: time stamps, edit lists, fields, axes, parts; files of other programs."""
+"""Metadata of containers: time stamps, edit lists, fields, axes, parts; files of other programs."""
 
 from fractions import Fraction
 from pathlib import Path

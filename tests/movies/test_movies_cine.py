@@ -1,4 +1,4 @@
-"""Phantom's .cine, written by the tests' own writer: pixels, row order, cropping, times, and what is refused."""
+"""Phantom's .cine, written by the tests' own writer: pixels, row order, cropping, times, and refusals."""
 
 import av
 import numpy as np

@@ -1,4 +1,4 @@
-"""Reading on after damage: what is lost is None, what is left is as it was, and keeps its number."""
+"""Reading on after damage: lost frames are None, the others are unchanged and keep their numbers."""
 
 from fractions import Fraction
 
@@ -141,7 +141,7 @@ def test_what_is_decoded_after_a_damaged_frame_is_spoilt_up_to_the_next_key_fram
         ([0, 2, 7, 8], "5/3", [0, 1, 4, 5]),  # two were lost
         ([0, 40, 80, 160], "20", [0, 1, 2, 4]),  # a header that counts fields
         ([0, 40, 95, 160], "40", [0, 1, 2, 3]),  # stamps that keep to no step only count
-        ([5, 45, 10**9], "40", [0, 1, 2]),  # nobody loses that many
+        ([5, 45, 10**9], "40", [0, 1, 2]),  # too many to be lost
     ],
 )
 def test_gaps_in_even_stamps_are_lost_frames(stamps, step, numbers):

@@ -1,4 +1,4 @@
-"""Writing: what is written comes back with its numbers and times, or nothing is left behind."""
+"""Writing: movies come back with their numbers and times, or no file is left."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Raw recording in a process of its own: no frame is held up, none is lost without a word, no file is half."""
+"""Raw recording in a process of its own: no frame is held up, lost ones are reported, no file is incomplete."""
 
 import multiprocessing
 import os

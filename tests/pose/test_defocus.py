@@ -1,4 +1,4 @@
-"""Soft pictures: their blur is seen before anything else is known, and templates that are as soft find the attitude."""
+"""Soft pictures: their blur is measured first, and templates of the same blur find the attitude."""
 
 import cv2
 import numpy as np

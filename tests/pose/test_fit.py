@@ -45,7 +45,7 @@ COUNT = 10
 DIAMETER_PX = 48.0
 SLOW = pytest.mark.slow
 RIGS = {"two": ("pinhole", "tsai"), "one": ("pinhole",)}
-# rms over poses of the noise and of what the model simplifies: rotation in degrees, place across the sight in mm
+# rms over poses of the noise and of the model's simplifications: rotation in degrees, place across the sight in mm
 ROTATION_RMS = {"two": 0.075, "one": 0.14}
 ACROSS_RMS_MM, DEPTH_RMS_MM = 0.009, 0.2
 
@@ -89,7 +89,7 @@ def apart_mm(one: FittedPoses, other: FittedPoses) -> float:
 
 
 def errors(fit: FittedPoses, X: Tensor, R: Tensor) -> Tensor:
-    """(B, 6): rotation in rad, place in mm; what the covariance is of."""
+    """Errors (B, 6) as in the covariance: rotation in rad, position in mm."""
     return torch.cat([turn_errors(fit, R), X - fit.position_lab_mm], dim=1)
 
 
@@ -277,7 +277,7 @@ def test_a_bubble_before_part_of_the_disk_does_not_move_the_pose():
     lured = whitened(from_truth(), errors(fit, X, R) - errors(from_truth(), X, R))
     assert rms(lured) < 0.8
     assert lured.abs().max() < 4
-    # Its score falls, for those pixels are not explained; it stays above any wrong pose's.
+    # Its score falls, because those pixels are not explained, but stays above any wrong pose's.
     assert (fit.score < from_truth().score).all()
     assert (fit.score > 0.5).all()
 
@@ -324,7 +324,7 @@ def test_changes_by_each_camera_alone_add_up_to_zero():
     weight = torch.linalg.inv(fit.own_covariance)
     mean = torch.linalg.solve(weight.sum(1), (weight @ fit.own_turn[..., None]).sum(1))[..., 0]
     assert rms(mean) < 0.3 * rms(fit.own_turn)
-    # They disagree by as much as they say.
+    # They disagree by as much as they state.
     fit = from_truth(count=40)
     apart = (fit.own_turn[:, 0] - fit.own_turn[:, 1])[..., None]
     root = torch.linalg.cholesky(fit.own_covariance.sum(1))
@@ -354,7 +354,7 @@ def second_shows(X: Tensor, R: Tensor, **changes: object) -> FittedPoses:
 def test_disagreement_of_cameras_in_attitude_is_measured():
     X, R = truth()
     delta = f64([0.006, -0.004, 0.008])
-    # The place held: else it moves to where paint and limb disagree least, and takes a part of the turn.
+    # The position is held: a free one would move and take a part of the rotation.
     held = (1e9 * torch.eye(3, dtype=torch.float64)).expand(COUNT, 3, 3)
     fit = second_shows(X, so3.exp(delta) @ R, place_precision=held)
     assert (fit.own_turn[:, 1] - fit.own_turn[:, 0] - delta).mean(0).norm() < 0.15 * delta.norm()
@@ -386,7 +386,7 @@ def test_a_camera_not_in_use_does_not_count(camera):
     assert one.position_lab_mm.equal(other.position_lab_mm)
     assert one.covariance.equal(other.covariance)
     assert one.nll.equal(other.nll)
-    # Along its own line of sight it knows little: lab y for the first, lab z for the second.
+    # Along its own line of sight its error is large: lab y for the first, lab z for the second.
     sigma = one.covariance.diagonal(dim1=1, dim2=2).sqrt()[:, 3:].mean(0)
     assert int(sigma.argmax()) == (1, 2)[camera]
     assert sigma.max() > 5 * sigma.median()
@@ -439,7 +439,7 @@ def test_a_prior_pulls_by_its_information():
     assert ((share > 0.2) & (share < 0.9)).all()
     for precision in (25.0, 400.0):
         assert_close(prior_pull(precision)[0], precision / (precision + own), atol=0.03)
-    # And it is the information that the covariance without a prior states, but for what a limb's error adds there.
+    # And it is the information of the covariance without a prior, less the part of a limb's error.
     stated = 1 / from_truth("one").covariance[:, 4, 4]
     assert ((own / stated > 0.9) & (own / stated < 6)).all()
     assert (fit.covariance[:, 4, 4] < from_truth("one").covariance[:, 4, 4]).all()
@@ -538,7 +538,7 @@ def test_a_fit_is_float64_with_rotations_that_are_rotations_and_covariances_that
 
 @pytest.mark.slow
 def test_errors_that_neighbours_share_widen_the_covariance():
-    # The same scatter in every pixel, but in clouds of two pixels: there is far less to learn from them.
+    # The same scatter in every pixel, but in clouds of two pixels: they hold far less information.
     X, R = truth()
     paint, ball = shares()
     clean = BEHIND + (BLACK - BEHIND) * ball + (WHITE - BLACK) * paint

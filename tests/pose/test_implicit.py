@@ -88,7 +88,7 @@ def test_neither_graph_nor_gradient_depends_on_the_number_of_iterations(points, 
 
 def test_frames_without_anything_are_nan_and_their_gradients_0(points):
     body, seen = points.clone(), points.clone()
-    seen[1] = 0.0  # what is there does not matter
+    seen[1] = 0.0  # values there do not matter
     seen.requires_grad_()
     use = torch.tensor([True, False, True])
     got, whole = fitted_points(body, seen, use=use), fitted_points(body, seen)
@@ -97,7 +97,7 @@ def test_frames_without_anything_are_nan_and_their_gradients_0(points):
     assert got.arrived.tolist() == [True, False, True]
     (gradient,) = torch.autograd.grad(got.R_lab_body[use].sum() + got.cost.sum(), seen)
     assert_close(gradient[1], torch.zeros_like(gradient[1]))
-    assert_close(got.R_lab_body[use], whole.R_lab_body[use])  # the others do not notice
+    assert_close(got.R_lab_body[use], whole.R_lab_body[use])  # the others do not change
     nobody = fitted_points(body, seen, use=torch.zeros(3, dtype=torch.bool))
     assert_close(torch.autograd.grad(nobody.cost.sum(), seen)[0], torch.zeros_like(seen))
 

@@ -1,4 +1,4 @@
-"""Errors that all frames share: small where there is noise alone, and as large as they are where light stays wrong."""
+"""Errors that all frames share: small with noise alone, and as large as the true errors with wrong light."""
 
 from dataclasses import replace
 from functools import cache
@@ -41,7 +41,7 @@ RIG = rig_of()
 
 @cache
 def studied(count: int, lobe: float, *, glints: bool) -> tuple[Pixels, FittedPoses, Tensor, SphereModel]:
-    """Fits to pictures with a reflection; without `glints` no model knows it."""
+    """Fits to pictures with a reflection; without `glints` no model holds it."""
     X, R = balls(count, 4)
     pictures = pictures_of(RIG, "patches", X, R)
     row, column = torch.meshgrid(*(torch.arange(size) for size in pictures.shape[-2:]), indexing="ij")
@@ -62,7 +62,7 @@ def studied(count: int, lobe: float, *, glints: bool) -> tuple[Pixels, FittedPos
 
 @cache
 def measured(count: int, lobe: float, *, glints: bool = False) -> tuple[Tensor, FittedPoses, Lasting]:
-    """Errors (B, 6), rad and mm, of such fits, and what lasts of them."""
+    """Errors (B, 6), rad and mm, of such fits, and their errors that last."""
     X, R = balls(count, 4)
     pixels, fit, use, model = studied(count, lobe, glints=glints)
     found = lasting_errors(pixels, fit, use, model)
@@ -193,7 +193,7 @@ def test_leaving_out_is_fitting_again():
 def test_the_difference_of_two_models_is_within_one_sigma():
     _, fit, found = measured(COUNT, 0.0)
     use = torch.ones(COUNT, 2, dtype=torch.bool)
-    use[::2, 1] = False  # whatever a camera that is not in use says counts for nothing
+    use[::2, 1] = False  # an unused camera does not count
     more = torch.tensor([[3e-3, 0.0, 0.0], [0.0, -2e-3, 0.0]], dtype=torch.float64)
     own = torch.where(use[..., None], fit.own_turn + more, torch.nan_to_num(torch.full((), torch.inf)))
     for turn_rad, moved_mm in ((1e-3, 0.02), (1e-7, 1e-6)):
@@ -207,7 +207,7 @@ def test_the_difference_of_two_models_is_within_one_sigma():
         )
         wide = found.widened(fit, other, use)
         way = torch.cat([turn, move])
-        if turn_rad < 1e-6:  # less than what lasts anyway
+        if turn_rad < 1e-6:  # less than the error that lasts anyway
             assert wide.covariance.equal(found.covariance)
             continue
         assert_close(way @ torch.linalg.solve(wide.covariance, way), torch.ones((), dtype=torch.float64), atol=1e-4)

@@ -1,4 +1,4 @@
-"""How much of the limb gives the position: what is left of it, by geometry, for compiled code and torch."""
+"""The share of the limb used for the position, by geometry, for compiled code and torch."""
 
 from dataclasses import replace
 

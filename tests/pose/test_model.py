@@ -61,7 +61,7 @@ def ball(reach_mm: float = 4.0) -> tuple[Tensor, Tensor]:
 
 
 def empty(rig: Rig, X: Tensor, shift: tuple[int, int] = (0, 0)) -> Pixels:
-    """The pixels about places, of pictures that show nothing."""
+    """The pixels about places, of empty pictures."""
     (camera,), (sight,) = rig.cameras, rig.sights
     stencil = disk_stencil(1.06 * rig.diameter_px / 2 + 2.5 * BLUR_PX)
     nothing = np.zeros((sight.size[1], sight.size[0]), np.float32)
@@ -256,7 +256,7 @@ def test_paint_changes_with_the_position_as_its_derivative_gives(model):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_sharp_paint_changes_as_its_derivatives_give_on_the_whole(model):
-    # What Gauss-Newton needs: the projection of a finite change on the derivatives gives the change's size back.
+    # For Gauss-Newton: the projection of a finite change on the derivatives is the change's size.
     one, (X, R) = rig(model, 40.0), ball()
     pixels = empty(one, X)
     assert exposed(sphere_view(pixels, X, R, model_of(table()))).max() > 0.9

@@ -59,7 +59,7 @@ def scene():
 
 
 def start(X, R, *, held: bool = False) -> PoseStart:
-    """Poses off by less and by more than the first step can mend."""
+    """Poses with errors below and above the reach of the first step."""
     count = len(X)
     off = torch.linspace(0.05, 2.0, count).tolist()
     use = torch.ones(count, 2, dtype=torch.bool)

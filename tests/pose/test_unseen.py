@@ -1,4 +1,4 @@
-"""Paint that no picture showed weighs nothing, whatever the map holds there."""
+"""Unseen paint has no weight, for any value of the map there."""
 
 import math
 
@@ -30,7 +30,7 @@ def fit(pixels, fill: float, known: bool, start=None):
 
 @pytest.fixture(scope="module")
 def known(pixels):
-    """The fit that knows which paint was never seen."""
+    """The fit with the mask of unseen paint."""
     return fit(pixels, 0.5, known=True)
 
 

@@ -1,4 +1,4 @@
-"""Paint that differs from the map is found, and weighs nothing."""
+"""Paint that differs from the map is found, and has no weight."""
 
 import math
 from dataclasses import replace
@@ -39,7 +39,7 @@ def found(pixels, paint, use=USE):
     return worn_cells(pixels, fit, use, model), fit, model
 
 
-# The pictures show the map; the map that is given has a grey cap: bare paint, seen from the other side.
+# The pictures show the whole map; the given map has a grey cap, as if the paint were worn.
 CAPPED = torch.where(map_directions(len(PAINT))[..., 2] > NORTH, 0.5, PAINT.double()).float()
 
 
@@ -47,7 +47,7 @@ def test_a_worn_cap_is_found_and_nothing_else(pixels):
     worn, _, _ = found(pixels, CAPPED)
     assert worn.shape == (CELLS**2,)
     inner, outer = CELL_Z > NORTH + 0.03, CELL_Z < NORTH - 0.05
-    assert float(worn[inner].float().mean()) > 0.85  # what is left are cells on borders, grey as the cap
+    assert float(worn[inner].float().mean()) > 0.85  # the rest are cells on borders, grey as the cap
     assert float(worn[outer].float().mean()) < 0.01
 
 

@@ -1,4 +1,4 @@
-"""How sure `init` is of the outline of a ball that stays in its place, partly hidden, in a holder."""
+"""Certainty of `init`'s outline of a fixed ball, partly hidden in a holder."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`sphereorient init`: what it measures, what it writes, and that the files it writes are read."""
+"""`sphereorient init`: its measurements and the files that it writes, which are read back."""
 
 import math
 import re
@@ -53,7 +53,7 @@ def init(*arguments: object) -> str:
 
 
 def no_ball(folder: Path, name: str = "empty.npy") -> Path:
-    """A movie that shows nothing: what is not of the look need not wait for one."""
+    """A movie of noise, for tests that need no ball."""
     np.save(folder / name, np.random.default_rng(0).integers(20, 24, (40, 48, 64)).astype(np.uint8))
     return folder / name
 
@@ -120,7 +120,7 @@ def leaves(model: type[BaseModel], before: str = "") -> Iterator[str]:
 
 
 def look(folder: Path) -> FirstLook:
-    """What a movie of noise shows, as if a ball of 80 px moved in it."""
+    """A movie of noise, with a look as if a ball of 80 px moved in it."""
     np.save(folder / "a.npy", np.zeros((40, 48, 64), np.uint8))
     movie = open_movie(folder / "a.npy")
     frame = {"found": 40, "looked": 40, "frame": 0, "picture": np.zeros((48, 64)), "outline": None}
@@ -281,7 +281,7 @@ def test_a_wrong_config_is_refused_by_its_key(tmp_path, line, message):
 
 
 def test_fictracs_own_rotation_comes_from_its_corners(tmp_path):
-    """The sample's config holds both: corners in a picture of 384 x 288 px, and what configGui made of them."""
+    """The sample's config holds both: corners in a picture of 384 x 288 px, and configGui's rotation from them."""
     text = CONFIG.replace("c2a_r            : { 0.72, -0.13, -0.46 }", "c2a_src : c2a_cnrs_xy")
     text += "c2a_cnrs_xy      : { 191, 171, 128, 272, 20, 212, 99, 132 }\nc2a_t : { -0.67, 0.39, 2.89 }\n"
     (tmp_path / "config.txt").write_text(text)

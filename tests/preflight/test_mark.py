@@ -1,4 +1,4 @@
-"""`sphereorient mark`: what is drawn becomes the mask, in a browser as well; and who may ask."""
+"""`sphereorient mark`: drawn shapes become the mask, also in a browser; requests need the token."""
 
 import base64
 import json
@@ -86,7 +86,7 @@ def test_a_mirrored_movie_keeps_its_mask_where_it_was_drawn(clean, tmp_path, how
     experiment = load_experiment(marking.path)
     file = cv2.imread(str(experiment.mask_paths["cam1"]), cv2.IMREAD_GRAYSCALE)
     drawn = drawn_mask((240, 240), [TRIANGLE], None)
-    assert np.array_equal(file > 127, drawn[::-1] if how == "vertical" else drawn.T)  # as the file of the movie lies
+    assert np.array_equal(file > 127, drawn[::-1] if how == "vertical" else drawn.T)  # as in the file
     assert np.array_equal(given_mask(experiment, "cam1", (240, 240)), drawn)
 
 
@@ -121,7 +121,7 @@ def test_the_server_answers_requests_with_the_token(marking, address):
 
 
 def test_the_map_is_laid_on_the_ball_as_it_lies_there(marking):
-    """The re-rendered ball looks like the picture, in its place."""
+    """The re-rendered ball looks like the picture, at its position."""
     said = marking.rendered("cam1")
     assert said["explained"] > 60
     content = np.frombuffer(base64.b64decode(said["picture"].partition(",")[2]), np.uint8)

@@ -1,4 +1,4 @@
-"""The measures of the check against oracles: outlines, blur, gaps, what start: must say."""
+"""The measures of the check against oracles: outlines, blur, gaps, the value of start:."""
 
 import math
 from pathlib import Path
@@ -101,7 +101,7 @@ def test_the_least_gap_is_at_the_planted_offset(late):
 def test_a_knock_does_not_hide_the_offset_where_the_motion_varies(late):
     steps = steps_of(late, knock_px=40.0)
     assert steps.shift == late
-    assert steps.in_step_px > 30  # and what the knock leaves stays visible
+    assert steps.in_step_px > 30  # and the error of the knock stays visible
 
 
 def test_a_ball_that_hardly_moves_gives_no_step():

@@ -1,4 +1,4 @@
-"""A fault of the cameras is planted, and the check names it and what mends it; a clean experiment is left in peace."""
+"""The check names planted faults of cameras and their remedy; a clean experiment gets no finding."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +30,7 @@ def test_a_movie_that_began_two_frames_early_is_found_and_the_start_that_mends_i
     found = of(result, "movies in step")
     assert found.severity is FAULT
     assert start in found.advice
-    assert of(result, "lines of sight").severity is OK  # once they are in step: the cameras are not to blame
+    assert of(result, "lines of sight").severity is OK  # once they are in step: no fault of the cameras
     mended = checked(early, tmp_path / "mended", start=yaml.safe_load(start), frames=[0, 60])
     assert of(mended, "movies in step").severity is OK
 

@@ -1,4 +1,4 @@
-"""What a short movie's own background may have made is no fault between cameras."""
+"""Differences that a short movie's own background may cause are no fault between cameras."""
 
 from pathlib import Path
 from types import SimpleNamespace

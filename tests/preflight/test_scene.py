@@ -1,4 +1,4 @@
-"""The check of several balls: too many or too few named, balls that are not found, sizes, and what is exchanged."""
+"""The check of several balls: too many or too few named, balls that are not found, sizes, and exchanged names."""
 
 from types import SimpleNamespace
 
@@ -52,7 +52,7 @@ def disk(x_mm: float, diameter_mm: float) -> Outline:
 
 
 def size_findings(x_mm: dict[str, float | None], true_mm: dict[float, float], **named: float):
-    """The findings on sizes where balls are found at x, and disks of true diameters are there."""
+    """Findings on sizes of balls found at x, with disks of true diameters."""
     seen = [disk(x, mm) for x, mm in true_mm.items()]
     found = {name: poses(x) for name, x in x_mm.items()}
     return {one.title.removeprefix("size of ball "): one for one in ball_sizes([found], [[seen, seen]], balls(**named))}

@@ -36,7 +36,7 @@ def open_page(browser: Any) -> Callable[..., AbstractContextManager[Any]]:
 
 @contextmanager
 def opened_page(browser: Any, path: Path, width: int = 1280, **more: Any) -> Iterator[Any]:
-    """A page from disk without a network; at the end nothing may have gone wrong in it."""
+    """A page from disk without a network; errors and requests fail the test."""
     context = browser.new_context(viewport={"width": width, "height": 900}, **more)
     context.set_offline(True)
     page = context.new_page()

@@ -1,4 +1,4 @@
-"""The picture of a track: drawn from what is true, it shows what was filmed, whatever the track lacks."""
+"""The picture of a track: drawn from the truth, it shows the filmed ball, also for tracks with gaps."""
 
 from dataclasses import replace
 

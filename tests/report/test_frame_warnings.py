@@ -1,4 +1,4 @@
-"""The sheet of the worst frames finds planted trouble and says what it is."""
+"""The sheet of the worst frames shows planted faults with their reasons."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The overlay shows what the track says, where the movie shows it."""
+"""The overlay draws the track at the right pixels of the movie."""
 
 from contextlib import ExitStack
 from dataclasses import replace

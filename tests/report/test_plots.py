@@ -1,4 +1,4 @@
-"""The figures of section IV: what was planted is what is drawn, in the units that the labels name."""
+"""The figures of section IV: planted values are drawn, in the units of the labels."""
 
 import re
 from collections.abc import Callable
@@ -302,7 +302,7 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
 
 @every_figure
 def test_a_component_has_its_colour_in_every_figure(name):
-    """Orange, green, blue and black, also to those who see neither red nor green."""
+    """Orange, green, blue and black, also for colour-blind readers."""
     colours = {"x": "#d55e00", "y": "#009e73", "z": "#0072b2", "all": "#000000"}
     figure = FIGURES[name]()
     artists = [line for axes in figure.axes for line in axes.lines]
@@ -766,7 +766,7 @@ def test_tracks_without_anything_measured_are_drawn(frames, cameras, tmp_path):
     for figure in figures:
         figure.canvas.draw()
         words = [text.get_text() for axes in figure.axes for text in axes.texts]
-        assert len(words) == len(figure.axes)  # every panel says that there is nothing
+        assert len(words) == len(figure.axes)  # every panel notes that it is empty
     if frames > 2000:
         assert "none of them in a segment" in note_of(figures[0])
     assert not any(np.isfinite(line.get_ydata()).any() for line in figures[0].axes[1].lines), "angles of NaN are not 0"

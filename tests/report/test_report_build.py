@@ -154,7 +154,7 @@ def test_same_tracks_same_numbers_and_same_pictures(place, report, tmp_path):
         assert report(place / "a/track.h5", "--out", tmp_path / name, *QUICK, "--quiet")[0] == 0
     files = sorted(path.relative_to(tmp_path / "first") for path in (tmp_path / "first").rglob("*.*"))
     for path in files:
-        if path.name != "index.html":  # which says when it was made
+        if path.name != "index.html":  # which holds its date
             assert (tmp_path / "first" / path).read_bytes() == (tmp_path / "second" / path).read_bytes(), path
 
 

@@ -1,4 +1,4 @@
-"""Planted trouble comes out in the strip and the stretches, and the pictures show the ball."""
+"""Planted faults appear in the strip and the stretches, and the pictures show the ball."""
 
 import html
 import io

@@ -1,4 +1,4 @@
-"""Lengths carry the track's unit in every output; nothing is said of the translation of a ball at a fixed place."""
+"""Lengths carry the track's unit in every output; a fixed ball has no translation."""
 
 import io
 import re
@@ -105,7 +105,7 @@ def test_tracks_of_different_units_are_not_averaged():
 
 
 def held(track, spread_mm=1e-9):
-    """The track of a ball at a fixed place: positions held there, with the place's own error."""
+    """The track of a fixed ball: one position, with its error."""
     rng = np.random.default_rng(1)
     place = np.array([1.0, 2.0, 3.0]) + spread_mm * rng.normal(size=(len(track), 3))
     still = {name: 1e-10 * rng.normal(size=(len(track), 3)) for name in ("velocity", "acceleration")}

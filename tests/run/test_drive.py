@@ -79,7 +79,7 @@ def test_an_experiment_that_fails_does_not_stop_the_others(tmp_path, alone):
 
 @pytest.mark.slow
 def test_a_worker_that_dies_is_replaced_and_its_experiment_goes_on(tmp_path, settings, alone):
-    """Killed when the first window is there: what it had done is not done again."""
+    """Killed after the first window: finished windows are not computed again."""
     request = Request(experiment=EXCERPT, out=tmp_path / "track.h5", settings=settings)
     executor = ProcessExecutor(1)
     killed: list[tuple[int, set[str]]] = []

@@ -159,7 +159,7 @@ def test_what_it_leaves_undecided_is_where_one_threshold_alone_is_wrong():
     paint = extract_paint(lit, VIEW.inside, OrientSettings())
     undecided = inside & (paint == 0)
     assert 0.01 < undecided.sum() / inside.sum() < 0.1
-    alone = extract_paint(lit, VIEW.inside, OrientSettings(region_contrast_min=1.0))  # no region speaks
+    alone = extract_paint(lit, VIEW.inside, OrientSettings(region_contrast_min=1.0))  # no region votes
     assert (alone[inside] != 0).all()
     assert torch.equal(alone[inside & ~undecided], paint[inside & ~undecided])
     assert (alone != truth)[undecided].double().mean() > 5 * (alone != truth)[inside & ~undecided].double().mean()

@@ -1,4 +1,4 @@
-"""Two proposers: who is asked when, and in which order their answers come."""
+"""Two proposers: which one is used, and the order of their proposals."""
 
 import math
 
@@ -17,7 +17,7 @@ def turned(*degrees: float) -> Tensor:
 
 
 def proposals(*disks: list[tuple[float, float]]) -> Candidates:
-    """Of each disk some pairs of angle (degrees) and score."""
+    """Proposals of each disk: pairs of angle (degrees) and score."""
     counts = torch.tensor([len(disk) for disk in disks])
     rows = [row for disk in disks for row in disk]
     return Candidates(
@@ -29,7 +29,7 @@ def proposals(*disks: list[tuple[float, float]]) -> Candidates:
 
 
 class Planted:
-    """Answers as planted, by the grey level of a disk's first pixel, and keeps what it was asked."""
+    """Planted proposals by the grey level of a disk's first pixel; keeps these levels."""
 
     def __init__(self, answers: dict[int, list[tuple[float, float]]], size_px: int = 4) -> None:
         self.answers, self.size_px, self.asked = answers, size_px, []

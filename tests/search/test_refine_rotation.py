@@ -30,7 +30,7 @@ def pixel_paint(kind: str) -> TextureTable:
 def disk_of(kind: str, R_view_body: torch.Tensor) -> torch.Tensor:
     """One disk without light or noise, as sharp as its pixels."""
     value, _ = pixel_paint(kind).sample((R_view_body.float().mT @ VIEW.normal_view.T)[None])
-    return VIEW.picture(20 + 150 * value[0], outside=200.0)  # what is beside the ball must not count
+    return VIEW.picture(20 + 150 * value[0], outside=200.0)  # pixels beside the ball must not count
 
 
 def away(R: torch.Tensor, angle_deg: float, count: int, seed: int = 0) -> torch.Tensor:

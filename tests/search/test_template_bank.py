@@ -35,7 +35,7 @@ def test_the_best_proposal_lies_within_the_fine_grids_covering(kind):
     assert error.max() < 4.0
     assert error.square().mean().sqrt() < 2.0
     assert found.score[found.offset[:-1]].min() > 0.88  # blurred borders of paint count in part
-    # The other reading of the matrix is no answer.
+    # The transpose is no answer.
     assert so3.geodesic_distance(found.R_view_body[found.offset[:-1]].mT, R_view_body).rad2deg().median() > 20
 
 
@@ -268,7 +268,7 @@ def test_disks_of_another_size_are_refused_and_an_odd_size_is_rounded_up():
     assert best_errors_deg(search.propose(clean_disks("blobs", R_view_body)), R_view_body).max() < 4
 
 
-# --- what is no picture of the sphere
+# --- pictures without the sphere
 
 
 def test_noise_fits_everywhere_and_is_a_runaway():

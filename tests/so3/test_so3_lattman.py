@@ -92,7 +92,7 @@ def test_every_rotation_is_near_one_of_the_grid(rng, degrees):
     distance = nearest_distance(so3.lattman_grid(step), R)
     assert distance.max() <= (0.5 + math.sqrt(0.5)) * step  # proved in the docstring
     assert distance.max() <= math.sqrt(3) / 2 * step  # measured: 0.78 to 0.83
-    assert distance.max() >= 0.7 * step  # and no finer than it says
+    assert distance.max() >= 0.7 * step  # and no finer than stated
 
 
 def test_only_the_last_row_holds_its_rotations_twice():

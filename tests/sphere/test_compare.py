@@ -1,4 +1,4 @@
-"""Maps compared: planted rotations, shifts and wear are found with their signs, and what is unknown stays so."""
+"""Maps compared: planted rotations, shifts and wear are found with their signs; unseen paint stays unknown."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The renderer: camera's pictures and disks, gradients, batches; the smooth pictures for derivatives of fits."""
+"""The renderer: pictures of cameras and disks, gradients, batches; smooth pictures for derivatives of fits."""
 
 from dataclasses import replace
 

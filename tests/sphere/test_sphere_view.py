@@ -1,4 +1,4 @@
-"""The canonical view: which normal a pixel shows, and its pictures (docs/errata.md A4)."""
+"""The canonical view: normals of its pixels, and its pictures (docs/errata.md A4)."""
 
 import math
 from functools import partial
@@ -193,7 +193,7 @@ def test_it_agrees_with_a_lookup_in_numpy_pixel_by_pixel(rng, dtype, view_of):
         assert (got[~view.inside] == -1.0).all()
         expected = looked_up(texture, torch.stack([R.T @ n for n in view.normal_view.double()]))
         assert_close(got[view.inside].double(), torch.from_numpy(expected), atol=atol)
-        # The transpose is another attitude, and seen.
+        # The transpose is another attitude, with another picture.
         transposed = torch.from_numpy(looked_up(texture, view.normal_view.double() @ R.T))
         assert (got[view.inside].double() - transposed).abs().mean() > 0.1
 

@@ -163,7 +163,7 @@ def test_lost_frames_and_gaps_in_time_are_not_spanned():
     track = track_of(true)
     later = np.arange(400) / RATE + 0.2 * (np.arange(400) >= 100)  # six frames dropped before frame 100
     wrong = true.copy()
-    wrong[100:] = true[100:] @ BODY  # what happened there is not compared
+    wrong[100:] = true[100:] @ BODY  # the frames there are not compared
     found = behaviour_of(replace(track, time=later, orientation=wrong), Reference(R_lab_body=true))
     assert found.pairs == 398
     np.testing.assert_allclose(found.gain.value, 1.0, atol=1e-9)
@@ -224,7 +224,7 @@ def test_smoothing_keeps_the_gain_of_a_ball_that_an_animal_turns():
         segment=torch.zeros(400, dtype=torch.int64),
     )
     found = smooth_motion(poses, SmoothSettings())
-    # Its rate is forgotten at once: the stated errors stay as they are, but for the share that lasts.
+    # A rate without memory: the stated errors stay, but for the share that lasts.
     assert found.orientation_scale == pytest.approx(1 / (1 - SmoothSettings().slow_share) ** 0.5)
     off = so3.geodesic_distance(found.R_lab_body, torch.from_numpy(true))
     assert float(off.median()) < 2.5 * sigma

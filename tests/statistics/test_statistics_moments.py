@@ -74,7 +74,7 @@ def test_sums_by_segment_add_up():
 
 
 def noisy(share: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Intermittent motion with a flatness of 6, what a noise adds, and the noise's sigma."""
+    """Intermittent motion with a flatness of 6, its noise, and the noise's sigma."""
     rng = np.random.default_rng(7)
     motion = rng.laplace(0, np.sqrt(0.5), (400_000, 3))
     sigma = np.sqrt(share)

@@ -1,4 +1,4 @@
-"""Degradations of pictures: each has the size that its unit says, and nothing of it is nothing."""
+"""Degradations of pictures: each has the size of its unit, and severity 0 changes nothing."""
 
 import math
 import subprocess
@@ -141,7 +141,7 @@ def test_the_same_seed_gives_the_same_bytes_and_the_input_stays(name):
     before = picture.clone()
     torch.manual_seed(1)
     first = only(name, severity(name, 4), picture)
-    torch.manual_seed(2)  # torch's own numbers have no say
+    torch.manual_seed(2)  # torch's own generator does not matter
     assert torch.equal(only(name, severity(name, 4), picture), first)
     assert torch.equal(picture, before)
     random = name not in ("contrast_loss", "defocus", "saturation")

@@ -1,4 +1,4 @@
-"""Degraded experiments: the truth stays true, and the files are wrong by as much as the unit says."""
+"""Degraded experiments: the truth stays, and the files are wrong by as much as the unit states."""
 
 import math
 from pathlib import Path
@@ -343,7 +343,7 @@ def test_given_principal_points_are_off_in_opposite_directions_and_lines_of_sigh
 
 
 def test_an_odd_seed_turns_the_first_camera():
-    """Before: only the second, and the first is believed where they contradict each other."""
+    """Before: only the second, and `track` prefers the first where they contradict each other."""
     true = default_cameras(SETTINGS)
     for seed, turned, kept in ((1, "cam1", "cam2"), (2, "cam2", "cam1")):
         given = wrong_cameras(true, {"camera_rotation": 5.0}, seed)

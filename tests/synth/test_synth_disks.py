@@ -1,4 +1,4 @@
-"""Single balls as a proposer wants them: where paint appears, what degradations do, the same for the same seed."""
+"""Single balls for a proposer: position of the paint, effect of degradations, the same for the same seed."""
 
 import math
 
@@ -40,7 +40,7 @@ def noiseless(monkeypatch):
 
 
 def dark_place(disk: Tensor) -> NDArray[np.float64]:
-    """Where the dot is, (right, down) in radii: mean of what is darkest for the light about it."""
+    """Where the dot is, (right, down) in radii: mean of the darkest pixels relative to the light about them."""
     inside = np.hypot(*np.moveaxis(AT, -1, 0)) < 0.85
     grey = disk.numpy()
     low = inside & (grey < 0.5 * (grey[inside].min() + np.median(grey[inside])))
@@ -112,7 +112,7 @@ def test_the_outline_is_the_pictures_border():
 
 
 def test_errors_of_the_outline_move_and_stretch_the_picture():
-    """Twenty pictures scatter by what the settings say: 0.5 px of a radius of 39 px."""
+    """Twenty pictures scatter by the settings' 0.5 px of a radius of 39 px."""
     dot = dotted(torch.tensor([0.0, 0, -1]))
     loose = DiskSettings(centre_sigma_px=2.0, radius_sigma=0.0)
     places = np.stack([dark_place(d) for d in film_disks(dot, torch.eye(3).expand(60, 3, 3), {}, seeded(), loose)])
@@ -192,7 +192,7 @@ def test_what_blurs_makes_pictures_less_sharp(name, rng):
 
 @pytest.mark.slow
 def test_a_blur_by_motion_is_about_the_attitude_in_the_middle_of_the_exposure():
-    """A dot is smeared on both sides of where it is."""
+    """A dot is smeared on both sides."""
     dot = dotted(torch.tensor([0.0, 0, -1]))
     film = film_disks(dot, torch.eye(3).expand(80, 3, 3), {"motion_blur": 8.0}, seeded(), EXACT)
     places = np.stack([dark_place(disk) for disk in film])

@@ -1,4 +1,4 @@
-"""Several balls in one movie: who is who in the files, no two overlap, nearer ones hide farther ones, one stays one."""
+"""Several balls in one movie: names in the files, no two overlap, nearer ones hide farther ones, one ball as before."""
 
 from pathlib import Path
 

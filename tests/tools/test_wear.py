@@ -1,4 +1,4 @@
-"""Wear planted in the maps of a series is found, grows as it was planted, and keeps its place from map to map."""
+"""Wear planted in a series of maps is found, grows as planted, and keeps its position from map to map."""
 
 import json
 import math
@@ -48,7 +48,7 @@ def near(spot: tuple[float, float], radius_deg: float) -> Tensor:
 
 
 def planted(k: int) -> Tensor:
-    """Where the k-th map is worn."""
+    """Worn cells of the k-th map."""
     first, later = RADII_DEG[k]
     return (near(FIRST_SPOT, first) & (first > 0)) | (near(LATER_SPOT, later) & (later > 0))
 

@@ -15,7 +15,7 @@ from sphereorient.errors import OutputError, ShapeError, TrackError
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
 FRAMES = 7
-# docs/data-format.md, written out once more so that the code's own table cannot vouch for itself
+# docs/data-format.md, written out once more so that the code's own table is not its own oracle
 FORMAT_SHAPES: dict[str, tuple[int, ...]] = {"time": (), "valid": (), "segment": (), "flags": (), "confidence": ()}
 FORMAT_SHAPES |= dict.fromkeys(("position", "position_smooth"), (3,))
 FORMAT_SHAPES |= dict.fromkeys(("position_cov", "position_smooth_cov", "orientation", "orientation_cov"), (3, 3))

@@ -1,4 +1,4 @@
-"""The Cramér-Rao bound: what can be worked out by hand, its laws, and the scatter of an estimator that reaches it."""
+"""The Cramér-Rao bound: values by hand, its laws, and the scatter of an estimator that reaches it."""
 
 import math
 
@@ -48,7 +48,7 @@ def test_a_white_ball_has_the_information_of_its_outline():  # oracle
 
 
 def test_one_straight_border_across_the_disk_has_the_information_worked_out_by_hand():  # oracle
-    # East white, west black: seen is one line through the middle, upright but for half a radian that keeps it off the
+    # East white, west black: the disk shows one line through the middle, tilted by half a radian to keep it off the
     # rows of pixels. Turned by d about the view's z, its point at distance s from the middle moves by s d, and the
     # squares add up to 2 r^3 / 3; about the line itself by sqrt(r^2 - s^2) d: 4 r^3 / 3.
     radius = 30.0

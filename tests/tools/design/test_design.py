@@ -1,4 +1,4 @@
-"""Paint before it is on the ball: how coarse it is, what its views can say, and strips of true size."""
+"""Paint before it is on the ball: its coarseness, the information of its views, and strips of true size."""
 
 import json
 import math
@@ -123,7 +123,7 @@ def test_views_that_are_near_each_other_are_not_counted_as_alike():
 
 @pytest.mark.slow
 def test_the_judgement_is_that_of_the_bound_and_finds_the_view_without_paint():
-    # Dots on one half only: the other half's middle is white, and nothing can be said there.
+    # Dots on one half only: the other half's middle is white, without information.
     direction = map_directions(128)
     texture = patterned_texture("dots", 15.0, 1, 128)
     texture = torch.where(direction[..., 0] > 0, texture, torch.ones_like(texture))

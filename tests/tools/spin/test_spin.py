@@ -25,7 +25,7 @@ QUICK = GreySearchSettings(size_px=32, score_min=0.05, peaks=12, finalists=8)
 
 
 def candidates(omega, time_s, *, wrong=2, scatter_deg=3.0, missing=(), seed=3):
-    """Candidates of pictures: the right one among `wrong` ones of the same belief; of `missing` ones none is right."""
+    """Candidates of pictures: the right one among `wrong` ones of equal score; `missing` ones have no right one."""
     rng = torch.Generator().manual_seed(seed)
     count = len(time_s)
     true = spinning(omega, so3.random_rotations((), generator=rng), time_s)
