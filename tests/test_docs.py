@@ -228,7 +228,7 @@ def cells(line: str) -> str:
 
 
 @pytest.mark.slow  # renders 60 frames and tracks them twice: a minute
-def test_the_commands_and_the_python_of_the_walkthrough_print_what_it_says(tmp_path, monkeypatch):
+def test_the_commands_and_the_python_of_the_walkthrough_print_its_output(tmp_path, monkeypatch):
     # A copy of the project's folder, so that its own out/ stays as it is.
     (tmp_path / ".venv").symlink_to(sys.prefix)
     (tmp_path / "out").mkdir()
@@ -304,7 +304,7 @@ def test_no_sentence_of_the_docs_stands_twice_and_words_do_not_grow(capsys):
     assert docs_words.main() == 0, capsys.readouterr().out
 
 
-def test_a_sentence_that_stands_twice_is_found_whatever_its_marks():
+def test_a_sentence_that_stands_twice_is_found_with_any_marks():
     once = "The ball is found by its outline in each picture."
     first = f"# Title\n\n{once}\n\n```\n{once}\n```\n\n| {once} |\n"
     second = "- The **ball** is found\n  by [its outline](a.md) in each picture. A short one."

@@ -34,7 +34,7 @@ from sphereorient.trajectory import Flag
 SETTINGS = PathSettings()
 
 
-def test_errata_a6_a_false_candidate_that_stands_still_deceives_the_paper_and_not_this_path(rng):
+def test_errata_a6_a_false_candidate_that_stands_still_is_taken_by_the_paper_and_not_by_this_path(rng):
     R = turning(40)
     still = turned_deg(R[0], 0.0, 0.0, 120.0)
     paper = assemble_path(

@@ -66,7 +66,7 @@ class Enumeration:
         return self.picture(f, k) * ratio / false
 
     def onward(self, f: int, k: int, state: dict) -> list[tuple[float, np.ndarray]]:
-        """Ways to go on from a state to a candidate: ratio of density and turn; none where the motion is lost."""
+        """Links from a state to a candidate: ratio of density and turn; none where the motion is lost."""
         g, j, dt = state["frame"], state["candidate"], self.time[f] - self.time[state["frame"]]
         if dt > (self.s.gap_frames_max + 1.5) * self.usual:
             return []
@@ -199,7 +199,7 @@ def world(seed: int, frames: int, sigma: float, change: float, seen_share: float
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma_deg", [0.1, 12.0])
-def test_frames_said_to_be_right_with_a_probability_are_so_at_least_that_often(sigma_deg):
+def test_frames_with_a_stated_probability_are_right_at_least_that_often(sigma_deg):
     probability, right = [], []
     for seed in range(3):
         settings = PathSettings(miss_probability=0.05)

@@ -325,7 +325,7 @@ def test_sigma_is_the_error_per_axis_of_the_mean(rng, first, second, within):
     assert abs(float(true_error) / best_possible - 1) < 0.15
 
 
-def test_sigma_of_good_frames_does_not_notice_the_frames_that_stayed_wrong(rng):
+def test_sigma_of_good_frames_does_not_depend_on_the_frames_that_stayed_wrong(rng):
     R = turning(4000, 0.3)
     left, right = noisy(R, 0.02, rng), noisy(R, 0.02, rng)
     wrong = torch.arange(20, 4000, 100)
@@ -461,7 +461,7 @@ def of_three(wrong: str, deceived) -> Fused:
 
 
 @pytest.mark.parametrize("wrong", THREE)
-def test_two_of_three_cameras_overrule_the_third_whatever_its_score(wrong):
+def test_two_of_three_cameras_overrule_the_third_at_any_score(wrong):
     whole = of_three(wrong, sees(turning(60), false_in=STRETCH, false_score=0.99, true_score=0.6))
     assert_close(whole.R_lab_body, turning(60), 1e-9)
     assert mended(whole, wrong) == list(STRETCH)

@@ -90,7 +90,7 @@ def test_a_track_of_one_ball_is_no_track_of_several(tmp_path):
         score_track(track, tmp_path / "truth.h5")
 
 
-def test_what_nearer_balls_hide_is_the_lens_that_two_circles_share():
+def test_the_part_that_nearer_balls_hide_is_the_lens_that_two_circles_share():
     """By hand: circles whose centres are a radius apart share 2/3 - sqrt(3) / (2 pi), 0.391, of each."""
     far, radius = 1e6, 9.0  # so far away that depth changes no size
     lens = PinholeCamera(

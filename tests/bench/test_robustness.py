@@ -99,7 +99,7 @@ def results(*outcomes: SceneResult) -> Results:
     return Results(settings=BenchSettings(), versions={}, outcomes=outcomes)
 
 
-def test_what_was_planted_is_measured(truth):
+def test_planted_values_are_measured(truth):
     path, R = truth
     found = SceneResult(scene="s", kind="k", level=1, seed=0, degradations={}, method="m",
                     seconds=2.0, **measure(planted(R), path))  # fmt: skip
@@ -186,7 +186,7 @@ def noisy(size: float, seed: int) -> tuple[float, ...]:
     return tuple((size * np.random.default_rng(seed).rayleigh(1.0, FRAMES)).tolist())
 
 
-def test_what_got_worse_is_named_and_scatter_is_not():
+def test_worse_results_are_named_and_scatter_is_not():
     before = results(outcome(orientation_deg=noisy(0.02, 1)), outcome(scene="spin-1-0-0", kind="spin"))
     same = results(outcome(orientation_deg=noisy(0.02, 2)), outcome(scene="spin-1-0-0", kind="spin"))
     assert not [change for change in compare_runs(same, before) if change.worse or change.better]
@@ -215,7 +215,7 @@ def never(experiment: Path) -> Trajectory:
     raise TrackError("movies: expected a ball, got none; look at them")
 
 
-def test_what_a_method_refuses_is_an_outcome(tmp_path):
+def test_a_refusal_by_a_method_is_an_outcome(tmp_path):
     (scene,) = scenes_of(BenchSettings(degradations=(), seeds=(0,), frames=12, together=0))
     (found,) = track_scene(write_scene(tmp_path, scene), scene, "never", never)
     assert found.refused.startswith("movies: expected a ball")

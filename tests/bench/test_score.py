@@ -106,7 +106,7 @@ def test_rates_count_only_where_they_were_measured(truth):
     assert score.relative_rms["omega_lab"] == pytest.approx(0.2, rel=1e-9)
 
 
-def test_what_was_never_measured_has_no_error(truth):
+def test_frames_without_a_measurement_have_no_error(truth):
     score = score_track(Trajectory.empty(truth["time"], cameras=("cam1",), frame_rate=600.0), TRUTH)
     assert not score.valid.any()
     assert np.isnan(score.percentiles_deg()).all()

@@ -20,7 +20,7 @@ from torch import Tensor
 from sphereorient.cameras import Camera, PinholeCamera
 
 F_PX, PITCH = 900.0, (0.02, 0.02)
-AT = torch.tensor([0.0, 0.0, 260.0], dtype=torch.float64)  # middle of what both see
+AT = torch.tensor([0.0, 0.0, 260.0], dtype=torch.float64)  # middle of the common view
 APART_DEG = 50.0  # between the cameras' axes
 # Tilt, direction of its axis, spin (degrees), and shift (mm) of each pose; none is seen from behind.
 POSES = [

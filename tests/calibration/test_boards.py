@@ -15,7 +15,7 @@ from sphereorient.errors import CameraError
 
 SIZE = (640, 480)
 FINER = 4  # pictures are drawn so many times finer, then averaged
-CORNERS = [[120, 60], [520, 110], [560, 400], [90, 430]]  # where the drawing's corners come to lie, px
+CORNERS = [[120, 60], [520, 110], [560, 400], [90, 430]]  # corners of the drawing in the picture, px
 PARTLY = [[-200, -60], [520, 110], [560, 400], [-250, 430]]
 
 Board = Chessboard | CharucoBoard | CircleGrid

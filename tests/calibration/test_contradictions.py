@@ -84,7 +84,7 @@ def test_cameras_may_differ_by_what_lasts_in_each_of_them():
 
 
 @pytest.mark.parametrize("why", [Reason.CONTRADICTS, Reason.SECOND_BALL])
-def test_a_camera_that_was_believed_alone_may_be_off_by_all_of_it(why):
+def test_a_frame_of_one_camera_alone_has_the_whole_disagreement_as_its_error(why):
     marked, _ = with_contradictions(track_of({"cam2": 1.0}, {}, why), CAMERAS, MM, True)
     assert (marked.flags == Flag.CONTRADICTION).all()
     np.testing.assert_allclose(np.degrees(np.sqrt(marked.orientation_cov[:, 1, 1])), 1.0, rtol=1e-3)
@@ -191,7 +191,7 @@ def test_a_frame_without_a_place_keeps_the_errors_of_its_orientation():
         (Reason.CONTRADICTS, 300.0, None, False),  # which has a flag of its own
     ],
 )
-def test_a_camera_that_should_show_the_whole_ball_and_does_not_is_noticed(why, u_px, shown, missed):
+def test_a_camera_that_should_show_the_whole_ball_and_does_not_is_found(why, u_px, shown, missed):
     camera = next(iter(CAMERAS.values()))
     scene = SimpleNamespace(shown=shown)
     centre_px, radius_px = torch.tensor([[u_px, 250.0], [300.0, 250.0]]), torch.full((2,), 40.0)

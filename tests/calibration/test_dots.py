@@ -154,7 +154,7 @@ def test_squares_bars_and_half_disks_are_no_dots() -> None:
         (np.full((40, 40), np.nan), "got NaN"),
     ],
 )
-def test_what_is_no_grey_picture_is_refused_in_one_line(picture: np.ndarray, said: str) -> None:
+def test_an_array_that_is_no_grey_picture_is_refused_in_one_line(picture: np.ndarray, said: str) -> None:
     with pytest.raises(CameraError, match=said) as refused:
         find_dots(picture)
     assert "\n" not in str(refused.value)

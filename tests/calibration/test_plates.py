@@ -158,7 +158,7 @@ def refused(path, words):
 
 
 @pytest.mark.slow
-def test_no_dots_found_is_said_with_the_first_reason(tmp_path):
+def test_a_picture_without_dots_has_the_first_reason(tmp_path):
     path = write(tmp_path)
     for name in pictures():
         if name.startswith("cam2"):

@@ -78,7 +78,7 @@ def test_a_planted_camera_comes_back(place, kappa1):
 @pytest.mark.parametrize(
     "T_mm", [(0.0, 0.0, 520.0), slow((0.0, 25.0, 520.0)), slow((25.0, 0.0, 520.0)), (400.0, -9e3, 9e2)]
 )
-def test_it_does_not_matter_where_the_labs_origin_appears(place, T_mm):
+def test_the_result_does_not_depend_on_where_the_labs_origin_appears(place, T_mm):
     pitch = (0.02, 0.025)
     camera = planted(T_cam_lab_mm=f64((3.0, -4.0, 520.0)), pixel_pitch_mm=f64(pitch))
     shift = camera.R_cam_lab.mT @ (camera.T_cam_lab_mm - f64(T_mm))  # the same scene in another lab

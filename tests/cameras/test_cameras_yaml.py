@@ -53,7 +53,7 @@ def test_a_tensor_that_requires_gradients_can_be_saved(tmp_path):
     assert load_cameras(tmp_path / "cameras.yaml")["cam1"].kappa1.item() == 1e-4
 
 
-def test_the_fields_of_the_file_mean_what_the_design_says(tmp_path):
+def test_the_fields_of_the_file_have_the_meaning_of_the_docs(tmp_path):
     camera = load_cameras(written(tmp_path, TSAI.replace("sx: 1.0", "sx: 1.5")))["cam1"]
     assert camera.image_size == (650, 480)
     # 52 mm aside at 520 mm: x_u = 4.5 mm = x_d (1 + 2.2e-4 x_d^2), u = 1.5 x_d / 0.02 + 324.5

@@ -52,7 +52,7 @@ def test_points_appear_where_opencv_puts_them(rng):
     assert float(np.abs(brown - expected).max()) > 50
 
 
-def test_pixels_see_where_opencv_says():
+def test_rays_of_pixels_agree_with_opencv():
     camera, uv_px = own(), whole_picture()
     uv_px = uv_px[((uv_px - camera.centre_px) / camera.f_px).norm(dim=-1) < 1.5]  # OpenCV stops at pi / 2
     sure = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-14)

@@ -51,7 +51,7 @@ def test_numbers_are_read_to_the_last_bit(tmp_path, suffix):
     ],
     ids=["matrix", "vector"],
 )
-def test_what_opencv_writes_is_read(tmp_path, distortion, pose):
+def test_files_of_opencv_are_read(tmp_path, distortion, pose):
     camera = load_opencv(opencv_file(tmp_path / "cam.xml", distortion_coefficients=distortion, **pose))
     x_lab_mm = np.array([[10.0, -20.0, 30.0], [-60.0, 5.0, 0.0]])
     expected, _ = cv2.projectPoints(x_lab_mm, np.array(ROTVEC), np.array(T_MM), K, D)

@@ -238,7 +238,7 @@ def test_straight_below_the_camera_gradients_are_finite_even_of_second_order(dty
     assert torch.isfinite(second).all()
 
 
-def test_what_the_camera_is_in_air_passes_through():
+def test_properties_of_the_camera_in_air_pass_through():
     camera = behind_port(tsai())
     assert camera.image_size == SIZE
     assert camera.R_cam_lab is camera.camera.R_cam_lab
@@ -269,7 +269,7 @@ def test_a_normal_of_three_digits_counts_as_a_direction_only(rng):
         ({"normal": turned()[2]}, "port: expected a camera before the wall"),
     ],
 )
-def test_what_is_no_wall_is_refused_in_one_line(changes, message):
+def test_an_impossible_wall_is_refused_in_one_line(changes, message):
     with pytest.raises(CameraError, match=message) as refused:
         behind_port(tsai(), **changes)
     assert "\n" not in str(refused.value)

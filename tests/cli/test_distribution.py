@@ -34,14 +34,14 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def python(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of an environment with the wheel, what it requires, and no extra."""
+    """The interpreter of an environment with the wheel, its requirements, and no extra."""
     folder = tmp_path_factory.mktemp("environment")
     venv.create(folder, with_pip=False, symlinks=True)
     own = Path(sysconfig.get_path("purelib", vars={"base": str(folder)}))
     (wheel,) = built.glob("*.whl")
     pip = [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python")]
     subprocess.run([*pip, "install", "-q", "--no-deps", "--no-index", str(wheel)], check=True)
-    # What the wheel requires is here already; the project's folder is not on this path.
+    # The wheel's requirements are installed already; the project's folder is not on this path.
     (own / "required.pth").write_text(sysconfig.get_path("purelib") + "\n")
     hidden = "".join(f"sys.modules[{name!r}] = None\n" for name in EXTRAS)
     (own / "sitecustomize.py").write_text(f"import sys\n{hidden}")

@@ -20,7 +20,7 @@ SEEN = {"opencv": ["camera:0 (640 x 480 px)"], "pylon": "no answer within 10 s"}
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    """One small ball, and cameras that are known."""
+    """One small ball, and calibrated cameras."""
     monkeypatch.setattr("sphereorient.bench.doctor.LIMITS_DEG", {40.0: 0.3})
     monkeypatch.setattr("sphereorient.bench.doctor.cameras_here", lambda: SEEN)
 

@@ -23,7 +23,7 @@ SCRIPTS = {"train_proposer": "train", "evaluate_proposer": "evaluate", "evaluate
 
 @pytest.fixture
 def script(monkeypatch, capsys):
-    """Run a script in this process; return its exit code, what it printed, and its errors."""
+    """Run a script in this process; return its exit code, its output, and its errors."""
 
     def run(name: str, *arguments: object) -> tuple[int, str, str]:
         path = REPO / "scripts" / f"{name}.py"

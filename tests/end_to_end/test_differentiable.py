@@ -230,7 +230,7 @@ def test_gradcheck_of_the_soft_track(rng):
     assert torch.autograd.gradcheck(track, inputs)
 
 
-def test_what_does_not_belong_together_is_refused(rng):
+def test_inconsistent_arguments_are_refused(rng):
     R, X, misfit = candidates(rng, 4, 3)
     mask = torch.ones(4, 3, dtype=torch.bool)
     with pytest.raises(ShapeError, match="misfit"):

@@ -88,7 +88,7 @@ def test_a_film_depends_on_synth_and_not_on_trackers():
     assert REPO / "sphereorient" / "pose" / "refine.c" in whole
 
 
-def test_what_was_noted_beside_a_file_is_read_again(tmp_path):
+def test_a_note_beside_a_file_is_read_back(tmp_path):
     made = tmp_path / "track.h5"
     assert kept.known(made) == {}
     kept.note(made, key="a", cpu_s=3.0)

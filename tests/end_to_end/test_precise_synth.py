@@ -101,7 +101,7 @@ def rms(z: np.ndarray) -> float:
 
 
 def check_nothing(track: Trajectory, rows: np.ndarray) -> None:
-    """None of these frames has a measurement, and each camera says why."""
+    """None of these frames has a measurement, and each camera has a reason."""
     assert not track.valid[rows].any()
     for name in ("position", "position_cov", "orientation", "orientation_cov", "confidence"):
         assert np.isnan(getattr(track, name)[rows]).all(), name
@@ -234,7 +234,7 @@ def test_30_percent_of_the_frames_dropped_cost_no_other_frame(brisk, tmp_path):
 
 @pytest.mark.slow
 def test_30_percent_dropped_in_each_camera_by_itself(brisk, tmp_path):
-    """A camera that comes back is used at once, whatever the other one does in that frame."""
+    """A camera that sees the ball again is used at once, with or without the other one."""
     rng = np.random.default_rng(0)
     one, other = (rng.choice(len(brisk), 36, replace=False) for _ in CAMERAS)
     neither = np.intersect1d(one, other)
@@ -437,7 +437,7 @@ def test_two_runs_give_the_same_bytes_with_one_thread_or_two(short, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_a_block_measures_does_not_depend_on_the_blocks_beside_it(short, tmp_path, monkeypatch):
+def test_measurements_of_a_block_do_not_depend_on_the_blocks_beside_it(short, tmp_path, monkeypatch):
     """Chunks, workers and a resumed run are all windows of other blocks."""
     made: list[BallTracker] = []
 

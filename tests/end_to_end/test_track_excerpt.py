@@ -91,7 +91,7 @@ def test_the_excerpt_meets_the_bars_of_the_paper_method(tracked):
     assert score.relative_rms["velocity"] <= 0.05
 
 
-def test_the_summary_says_what_is_valid_and_what_each_camera_lost(tracked):
+def test_the_summary_counts_valid_frames_and_the_losses_of_each_camera(tracked):
     _, run = tracked
     assert "40 of 40 frames valid" in run.stdout
     assert "cam1: frames lost: none" in run.stdout

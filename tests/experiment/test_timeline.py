@@ -103,7 +103,7 @@ def test_a_table_that_is_none_is_refused(folder, name):
     assert "\n" not in str(refused.value)
 
 
-def test_stamps_pair_the_cameras_whatever_either_lost(folder):
+def test_stamps_pair_the_cameras_whichever_pictures_either_lost(folder):
     """cam1 lost picture 3, cam2 lost pictures 1 and 5, and is 0.2 ms late: stamps show it, counting would not."""
     grid = np.arange(8) * 0.01
     save_stamped(folder / "cam1.h5", np.delete(grid, 3).tolist())
@@ -136,7 +136,7 @@ def test_cameras_that_are_late_on_each_other_are_reported(folder):
     assert "differ by 0.002 s" in line(folder, STAMPED).remarks[0]
 
 
-def test_a_movie_without_stamps_is_refused_where_they_are_asked_for(folder):
+def test_a_movie_without_stamps_is_refused_where_the_experiment_uses_them(folder):
     with pytest.raises(MovieError, match="time stamps, got none"):
         line(folder, BOTH.replace("frame_rate: 30", "times: movies"))
 
@@ -173,7 +173,7 @@ def test_times_off_any_grid_are_refused_for_methods_that_need_one():
         Timeline(number=np.arange(5), time_s=time_s, rows={}).gridded()
 
 
-def test_stamps_of_three_cameras_make_one_frame_whatever_each_lost(folder):
+def test_stamps_of_three_cameras_make_one_frame_whichever_pictures_each_lost(folder):
     grid = np.arange(6) * 0.01
     save_stamped(folder / "cam1.h5", np.delete(grid, 1).tolist())
     save_stamped(folder / "films" / "cam2.h5", (np.delete(grid, [1, 3]) + 0.0002).tolist())

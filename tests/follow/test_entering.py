@@ -22,7 +22,7 @@ SETTINGS = load_settings(None, [*SHORT[1:], "refine.chunk_frames=16"])
 
 @pytest.fixture(scope="module")
 def known(tmp_path_factory):
-    """The track of the excerpt, and the file of what was learnt."""
+    """The track of the excerpt, and the file of its appearance."""
     path = tmp_path_factory.mktemp("known") / "learnt.h5"
     return run(Request(experiment=EXCERPT, settings=SETTINGS, save_learnt=path), MemoryStore()), path
 

@@ -61,7 +61,7 @@ def test_frames_that_are_far_off_hardly_move_the_mean_position():
     )
     sigma = C.diagonal().sqrt()
     assert ((place - good).abs() < 2 * sigma).all()
-    assert ((plain - good).abs() > 4 * sigma).any(), "a mean that believes all is carried away"
+    assert ((plain - good).abs() > 4 * sigma).any(), "a plain mean is far off"
 
 
 def test_measurements_that_scatter_by_more_than_they_state_weigh_less():
@@ -179,7 +179,7 @@ def test_all_frames_are_measured_in_one_place_and_better(tmp_path_factory, camer
     sigma = place.covariance_mm2.diagonal().sqrt()
     assert ((at - place.position_lab_mm).abs() < 0.1 * sigma).all(), "one place"
     off = place.position_lab_mm - X[0]
-    assert float(off @ torch.linalg.solve(place.covariance_mm2, off)) < 16, "where it is, as its error says"
+    assert float(off @ torch.linalg.solve(place.covariance_mm2, off)) < 16, "within its stated error"
     errors = [so3.log(R @ torch.stack([poses.R_lab_body[0] for poses in some]).mT) for some in (free, held)]
     steps = [torch.diff(error, dim=0).norm(dim=1).median() for error in errors]
     assert float(errors[1].norm(dim=1).median()) < 0.92 * float(errors[0].norm(dim=1).median())
@@ -188,7 +188,7 @@ def test_all_frames_are_measured_in_one_place_and_better(tmp_path_factory, camer
     assert float((turns.mean(0) - expected).norm()) < 0.12 * float(expected.norm())
     covariance = torch.stack([poses.covariance[0, :3, :3] for poses in held])
     away = (errors[1][:, None] @ torch.linalg.solve(covariance, errors[1][..., None]))[:, 0, 0]
-    assert 0.3 < float(away.mean()) / 3 < 4, "and the attitudes' errors are as their covariances say"
+    assert 0.3 < float(away.mean()) / 3 < 4, "the attitudes' errors are as stated"
 
 
 def declared(folder: Path) -> tuple[Path, Path]:
@@ -212,7 +212,7 @@ def test_a_ball_declared_fixed_has_one_place_in_its_track(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_what_another_run_learnt_measures_in_the_same_place_to_the_last_bit(tmp_path_factory, tmp_path):
+def test_the_appearance_of_another_run_measures_at_the_same_position_to_the_last_bit(tmp_path_factory, tmp_path):
     _, fixed = declared(tmp_path_factory.getbasetemp() / "in_its_place")
     known = tmp_path / "learnt.h5"
     first = run(Request(experiment=fixed, cameras=("cam1",), save_learnt=known), MemoryStore())

@@ -135,7 +135,7 @@ def test_a_picture_that_cannot_be_used_leaves_the_ball_to_the_other_camera():
     assert found["b"].reason == (Reason.OK, Reason.MISSING)
 
 
-def test_a_place_whose_fit_does_not_explain_the_pictures_is_given_to_another_paint_or_to_nobody():
+def test_a_position_whose_fit_does_not_explain_the_pictures_goes_to_another_paint_or_to_no_ball():
     found = start_of(paint0=(2,))(frames_of(TRUTH), ["a", "b", "c"], {})
     assert sorted(len(found[name]) for name in "ac") == [0, 1]
     assert len(found["b"]) == 1

@@ -51,7 +51,7 @@ def lane(frames: list[int], change: float, times: list[float] = TIMES) -> Chunk:
 
 
 @pytest.mark.parametrize(("frames", "change"), [([1, 2], 0.0), ([0, 1, 2], 0.0), ([0, 1, 2], 0.02)], ids=str)
-def test_the_next_pose_continues_the_motion_whatever_the_times(frames, change):
+def test_the_next_pose_continues_the_motion_at_any_times(frames, change):
     expected = lane(frames, change).expected(3, RADIUS_MM)
     assert not expected.rough
     assert_close(f64(expected.position_lab_mm), place(3.2, change), 1e-9)

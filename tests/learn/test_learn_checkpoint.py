@@ -138,7 +138,7 @@ def packed(path: Path) -> None:
 
 
 def claims_much(path: Path) -> None:
-    """One whose directory says that an entry is larger than the file."""
+    """One whose directory claims an entry larger than the file."""
     archived_again(path, claimed=2_000_000_000)
 
 
@@ -241,7 +241,7 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch)
     assert [entry.name for entry in tmp_path.iterdir()] == ["proposer.ckpt"]
 
 
-def test_a_map_is_known_by_its_grey_levels_whatever_its_file(tmp_path):
+def test_a_map_is_identified_by_its_grey_levels_in_any_file(tmp_path):
     grey = (255 * random_texture("dots", 2, 64)).round().to(torch.uint8).numpy()
     paths = [tmp_path / name for name in ("a.png", "b.tiff", "c.png")]
     cv2.imwrite(str(paths[0]), grey)

@@ -82,7 +82,7 @@ def test_the_log_has_a_row_an_epoch(trained):
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_weights_and_another_does_not(short, tmp_path):
-    torch.manual_seed(99)  # what was drawn before does not matter
+    torch.manual_seed(99)  # earlier draws do not matter
     again = train_proposer(tiny(**SHORT), tmp_path / "again")
     assert same(again.checkpoint, short[0].checkpoint)
     assert again.rows == short[0].rows
@@ -131,7 +131,7 @@ def test_it_goes_on_with_the_same_settings_only_but_may_be_longer(short, tmp_pat
 
 
 @pytest.mark.parametrize("kind", ["none", "text", "half", "code", "of ours"])
-def test_what_is_no_file_to_go_on_from_is_refused_and_nothing_executed(short, tmp_path, kind):
+def test_a_file_that_is_no_checkpoint_to_resume_from_is_refused_and_nothing_executed(short, tmp_path, kind):
     last, mark = tmp_path / "last.ckpt", tmp_path / "mark.txt"
     whole = (short[1] / "last.ckpt").read_bytes()
     if kind == "text":
@@ -151,7 +151,7 @@ def test_what_is_no_file_to_go_on_from_is_refused_and_nothing_executed(short, tm
 
 @pytest.mark.slow
 def test_a_checkpoint_to_begin_with_gives_its_weights(short, tmp_path):
-    """A learning rate of nearly nothing: the weights stay, whatever the seed."""
+    """A learning rate of nearly zero: the weights stay, with any seed."""
     start = str(short[1] / "proposer.ckpt")
     changed = {"epochs": 1, "steps": 1, "learning_rate": 1e-12, "weight_decay": 0.0}
     tuned = train_proposer(tiny(seed=5, start=start, **changed), tmp_path)

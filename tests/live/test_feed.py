@@ -244,7 +244,7 @@ def test_a_slow_source_does_not_stall(monkeypatch):
             yield replace(arrival, arrived_s=time.perf_counter())
 
     list(Feed(source(), 10, wait=True, log=messages.append))
-    assert len(messages) <= 4  # before the second frame nothing is known of the rate
+    assert len(messages) <= 4  # before the second frame the rate is unknown
 
 
 def test_a_ring_that_another_one_replaces_is_read_on(recording, tmp_path):

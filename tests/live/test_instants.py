@@ -85,7 +85,7 @@ def whole(shown: list[list[int | None]]) -> float:
     return np.mean([None not in row for row in shown])
 
 
-def test_pictures_of_one_trigger_are_one_instant_whatever_the_clocks():
+def test_pictures_of_one_trigger_are_one_instant_with_any_clocks():
     shown, messages = together(Rig())
     assert whole(shown[20:]) == 1
     assert shown[-1] == [399, 399]
@@ -229,7 +229,7 @@ def test_a_picture_that_is_not_whole_is_none_and_its_instant_does_not_wait():
     assert "cam1 incomplete 1" in messages[0]
 
 
-def test_several_cameras_want_clocks():
+def test_several_cameras_need_clocks():
     instants, raw = Instants(["cam1", "cam2"], print), RawPicture(picture=np.zeros((1, 1)), arrived_s=1.0, counter=3)
     instants.take(1, raw)
     with pytest.raises(MovieError, match="cam2: expected time stamps"):

@@ -253,7 +253,7 @@ def test_a_serial_port_that_vanishes_is_reported_once(line):
 
 
 @pytest.mark.parametrize("rate", ["", "@", "@fast", "@0", "@-9600", "@²", "@99999999999999999999"])
-def test_what_is_no_baud_rate_is_refused(line, rate):
+def test_an_impossible_baud_rate_is_refused(line, rate):
     with pytest.raises(OutputError, match="baud rate") as messages:
         SerialOutput(f"{line[1]}{rate}", pytest.fail)
     assert "\n" not in str(messages.value)

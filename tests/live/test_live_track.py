@@ -145,7 +145,7 @@ def test_a_journal_that_was_cut_anywhere_is_the_track_until_there(run, tmp_path)
             Trajectory.load(journal.journal_path(path))
 
 
-def test_what_is_there_is_not_written_over(tmp_path):
+def test_existing_files_are_not_replaced(tmp_path):
     for name in ("track.h5", "track.h5.partial"):
         (tmp_path / name).write_text("mine")
         with pytest.raises(OutputError, match="expected a new file"):

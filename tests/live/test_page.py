@@ -218,7 +218,7 @@ def test_a_page_process_that_is_killed_is_reported_and_tracking_goes_on(recordin
 
 
 @pytest.mark.slow  # a process of its own, which imports torch
-def test_what_is_wrong_with_the_files_is_reported_by_the_loop_alone(tmp_path, capfd):
+def test_faults_of_the_files_are_reported_by_the_loop_alone(tmp_path, capfd):
     (tmp_path / "experiment.yaml").write_text((EXCERPT / "experiment.yaml").read_text())  # without movies
     page = PageProcess(tmp_path / "experiment.yaml", None, 0, pytest.fail)
     page.process.join()

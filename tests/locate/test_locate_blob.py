@@ -81,7 +81,7 @@ def test_flicker_of_the_balls_shape_does_not_hide_the_ball():
     assert np.hypot(best.u_px - 90.0, best.v_px - 110.0) < 8
 
 
-def test_there_are_no_more_blobs_than_asked_for():
+def test_there_are_no_more_blobs_than_the_setting_allows():
     difference = difference_of(plant(white, 110.0, 95.0, shape=WIDE, also=STREAKS))
     assert len(find_blobs(difference, FLAT, DIAMETER, LocateSettings(blob_candidates=1))) == 1
     assert len(find_blobs(difference, FLAT, DIAMETER, LocateSettings(blob_candidates=3))) <= 3

@@ -41,7 +41,7 @@ def test_instants_between_are_turned_as_their_neighbours_were():
     assert float(so3.geodesic_distance(found, true).max()) < 1e-9
     ends = interpolated(chain, torch.tensor([1, 3]), true[[1, 3]])
     off = so3.geodesic_distance(ends, true)
-    assert off[[0, 4]].tolist() == pytest.approx([0.02, 0.02], abs=1e-9), "beyond the known ones as the nearest was"
+    assert off[[0, 4]].tolist() == pytest.approx([0.02, 0.02], abs=1e-9), "beyond: the error of the nearest"
 
 
 @pytest.mark.slow

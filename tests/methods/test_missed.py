@@ -46,5 +46,5 @@ def test_where_another_camera_measures_the_map_is_not_doubted():
     [ALL, [Reason.OK] + [Reason.NOT_FOUND] * 9, [Reason.CONTRADICTS] * FRAMES, [Reason.MISSING] * FRAMES],
     ids=["all", "once", "elsewhere", "no pictures"],
 )
-def test_nothing_is_said_of_a_camera_that_sees_the_ball_or_has_no_pictures(seen):
+def test_a_camera_that_sees_the_ball_or_has_no_pictures_gets_no_remark(seen):
     assert remarks_on(ALL, seen) == []

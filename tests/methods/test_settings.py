@@ -311,7 +311,7 @@ def test_every_key_is_read_by_a_method_and_each_method_accepts_the_defaults():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["precise", "paper"])
-def test_a_method_reads_the_keys_that_it_is_said_to_read_and_no_other(method, monkeypatch):
+def test_a_method_reads_the_keys_that_the_settings_name_for_it_and_no_other(method, monkeypatch):
     """All attributes of settings are noted while the excerpt is tracked."""
     models = {type(part): (branch, set(type(part).model_fields)) for branch, part in Settings()}
     read = set()

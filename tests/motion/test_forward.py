@@ -138,7 +138,7 @@ def test_time_that_stands_or_goes_back_begins_anew():
     assert unknown[FIRST:].tolist() == [60, 61, 80, 81]
 
 
-def test_noise_that_is_greater_than_stated_is_noticed():
+def test_noise_that_is_greater_than_stated_is_found():
     time_s, sigma = np.arange(600) / 200, np.full(3, 6e-4)
     truth = planted(3.0, 0.1, time_s)
     value, stated = turning(time_s, noisy(truth, sigma), sigma / 2)

@@ -115,7 +115,7 @@ def test_the_motion_of_the_experiment_is_recovered_as_a_plain_gaussian_process_d
 
 
 @pytest.mark.parametrize("omega_rms", [slow(10.5), slow(145.0), 292.0], ids=["2 deg", "22 deg", "45 deg a frame"])
-def test_every_sigma_is_honest_whatever_the_turn_between_frames(omega_rms: float, rng: torch.Generator) -> None:
+def test_every_sigma_is_that_of_its_errors_for_any_rotation_rate(omega_rms: float, rng: torch.Generator) -> None:
     truth = planted(omega_rms)
     result = smoothed(truth, *measured(truth, rng))
     assert 0.7 < over_sigma(turn_off(truth, result), result.orientation_cov_rad2) < 1.4
@@ -157,7 +157,7 @@ def test_slow_errors_are_covered_by_the_share_that_is_set_aside_for_them(rng: to
 @pytest.mark.parametrize(
     ("omega_rms", "lost"), [slow(10.5, (60, 80)), slow(22.0, (60, 72)), (292.0, (60, 72))], ids=str
 )
-def test_a_gap_is_bridged_with_sigmas_as_large_as_the_errors(
+def test_a_gap_is_bridged_with_the_sigmas_of_its_errors(
     omega_rms: float, lost: tuple[int, int], rng: torch.Generator
 ) -> None:
     truth = planted(omega_rms)
@@ -303,7 +303,7 @@ def test_segments_do_not_depend_on_each_other(rng: torch.Generator) -> None:
     for entry in fields(Smoothed):
         values = getattr(one, entry.name)
         if isinstance(values, Tensor) and values.is_floating_point():
-            if "given_path" not in entry.name:  # a frame outside all segments keeps what it measured
+            if "given_path" not in entry.name:  # a frame outside all segments keeps its measurement
                 assert values[85:90].isnan().all(), entry.name
             assert values[:85].isfinite().all(), entry.name
             # the factor on the sigmas is learnt from all segments, the motion of each from itself
@@ -392,7 +392,7 @@ def test_a_slow_share_adds_its_part_of_the_measured_variance_to_the_covariances_
     assert_close(with_slow.velocity_sigma_m_s, without.velocity_sigma_m_s)
 
 
-# what the path of positions says of orientations
+# orientations given the path of positions
 
 SHARED_PART = 0.9  # correlation of the errors of turn and place along each axis
 

@@ -1,4 +1,4 @@
-"""Files that people asked about in public: containers and units (../shared/cases, each with its README)."""
+"""Files from public questions: containers and units (../shared/cases, each with its README)."""
 
 import math
 import re
@@ -31,7 +31,7 @@ def remarks(movie, word: str) -> list[str]:
 
 
 def middle(movie, level: int = 60) -> tuple[float, float]:
-    """The middle (u, v) of what differs from the border, px: the ball's."""
+    """The middle (u, v), px, of the pixels that differ from the border: the ball's."""
     picture = movie.sample([0])[0].astype(float)
     v, u = np.nonzero(abs(picture - np.median(picture[:3])) > level)
     return (u.min() + u.max()) / 2, (v.min() + v.max()) / 2

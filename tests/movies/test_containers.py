@@ -68,7 +68,7 @@ def test_uneven_stamps_that_are_rounded_too_coarsely_are_no_times(tmp_path):
 @pytest.mark.parametrize(
     "times_s", [JITTER_S, np.arange(12) / 30, 7 + np.arange(12) / 30], ids=["uneven", "even", "late"]
 )
-def test_a_cut_off_matroska_is_truncated_whatever_its_stamps(tmp_path, times_s):
+def test_a_cut_off_matroska_is_truncated_with_any_stamps(tmp_path, times_s):
     path = stamped(tmp_path / "movie.mkv", times_s)
     assert not remark(open_movie(path), "truncated")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -120,7 +120,7 @@ def test_interlaced_frames_are_to_be_parted_first(tmp_path, interlaced):
 
 @pytest.mark.parametrize("chunks", [None, (4, 37, 51), (7, 20, 20)])
 @pytest.mark.parametrize("suffix", [".h5", ".mat"])
-def test_what_matlab_saved_has_rows_and_columns_as_there(tmp_path, suffix, chunks):
+def test_movies_of_matlab_have_its_rows_and_columns(tmp_path, suffix, chunks):
     """MATLAB saves H x W x N as (N, W, H)."""
     frames = pictures()
     with h5py.File(tmp_path / f"movie{suffix}", "w", userblock_size=512) as file:

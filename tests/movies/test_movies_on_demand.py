@@ -91,7 +91,7 @@ def test_only_slices_that_hold_the_part_are_decoded_here_and_ahead_in_the_next_f
         assert decoded[2:] == [[1]]
 
 
-def test_a_part_may_be_asked_for_after_the_pool_has_closed(tmp_path: Path) -> None:
+def test_a_part_may_be_read_after_the_pool_has_closed(tmp_path: Path) -> None:
     expected = pictures(count=2)
     path = written(tmp_path / "m.mkv", expected, slices="9")
     with ThreadPoolExecutor(2) as pool:

@@ -29,7 +29,7 @@ def damage(path, numbers) -> None:
 
 
 def blank(path, number) -> None:
-    """Overwrite all of a packet: codecs without check sums do not notice less."""
+    """Overwrite all of a packet: codecs without check sums do not detect less."""
     content = bytearray(path.read_bytes())
     at, size = packet_places(path)[number]
     content[at : at + size] = bytes(size)
@@ -128,7 +128,7 @@ def packets(order: str) -> list[Packet]:
         ("ABCD", "b", "b"),
     ],
 )
-def test_what_is_decoded_after_a_damaged_frame_is_spoilt_up_to_the_next_key_frame(order, damaged, spoilt):
+def test_frames_after_a_damaged_one_are_spoilt_up_to_the_next_key_frame(order, damaged, spoilt):
     index = index_packets(packets(order), guessed=False)
     numbers = {ord(letter) - ord("a") for letter in spoilt}
     assert set(index.spoilt_by(ord(damaged) - ord("a"))) == numbers

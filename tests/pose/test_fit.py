@@ -253,7 +253,7 @@ def test_a_picture_that_is_white_all_over_is_not_explained_by_paint(body, monkey
     assert float(fitted(rig(), "patches", white, X, R, SIGMA).score.max()) < 0.1
 
 
-def test_the_deviation_of_normal_residuals_is_one_whatever_a_few_of_them_are():
+def test_the_deviation_of_normal_residuals_is_one_with_a_few_arbitrary_ones():
     rng = torch.Generator().manual_seed(0)
     residual = 3.0 * torch.randn(2, 40000, generator=rng)
     residual[:, ::9] = 500.0

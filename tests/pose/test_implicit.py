@@ -157,7 +157,7 @@ def test_small_errors_multiply_from_the_left_in_lab_components():
     assert_close(large @ large.mT, torch.eye(3, dtype=torch.float64)[None])
 
 
-def test_what_does_not_belong_together_is_refused(points):
+def test_inconsistent_arguments_are_refused(points):
     view, zero = torch.eye(3).expand(2, 3, 3), torch.zeros(2, 3)
     with pytest.raises(ShapeError, match="residual"):
         implicit_pose(lambda R, X: X.sum(), view, zero)

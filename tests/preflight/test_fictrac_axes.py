@@ -66,7 +66,7 @@ def config(tmp_path: Path, about: FicTracSetUp, more: str = "") -> Path:
     ids=["sample", "no turn", "elsewhere", "fisheye"],
 )
 @pytest.mark.parametrize("lab", ["animal", "another"])
-def test_the_table_is_what_fictracs_formulas_give_whatever_the_lab_of_the_experiment(tmp_path, about, lab):
+def test_the_table_is_that_of_fictracs_formulas_for_any_lab_of_the_experiment(tmp_path, about, lab):
     R_cam_body, turn = walked(), Rotation.from_rotvec(-about.c2a_r if lab == "animal" else [1.0, 2.0, 0.5])
     R_cam_lab = turn.as_matrix()
     axes = fictrac_axes(camera(R_cam_lab), config(tmp_path, about))

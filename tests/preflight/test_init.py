@@ -44,7 +44,7 @@ vfov             : 45
 
 
 def init(*arguments: object) -> str:
-    """Run the command as a user does, without a terminal; return what it prints."""
+    """Run the command as a user does, without a terminal; return its output."""
     run = CliRunner().invoke(app, ["init", *map(str, arguments)])
     if isinstance(run.exception, SphereOrientError):
         raise run.exception
@@ -364,7 +364,7 @@ def test_fictracs_fisheye_has_one_angle_for_every_pixel(clean, tmp_path):
     assert camera.f_px.tolist() == pytest.approx([height_px / math.radians(190)] * 2)
 
 
-def test_init_replaces_its_own_file_until_somebody_changes_it(tmp_path):
+def test_init_replaces_its_own_file_until_a_user_changes_it(tmp_path):
     movie, out = no_ball(tmp_path), tmp_path / "experiment.yaml"
     init(movie, "--out", out)
     first = out.read_text()

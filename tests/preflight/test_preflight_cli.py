@@ -48,7 +48,7 @@ def test_a_figure_that_cannot_be_written_is_refused_before_the_work(clean, tmp_p
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["one camera", "no ball", "painted"])
-def test_the_figure_is_drawn_whatever_is_missing(clean, tmp_path, case):
+def test_the_figure_is_drawn_with_any_part_missing(clean, tmp_path, case):
     keys = {}
     example = clean
     if case == "one camera":

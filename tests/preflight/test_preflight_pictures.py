@@ -202,7 +202,7 @@ def test_check_invents_no_fault_of_what_track_measures(name):
 
 @pytest.mark.shared
 @pytest.mark.slow
-def test_check_looks_at_a_held_ball_as_track_does_whatever_its_paint(tmp_path):
+def test_check_looks_at_a_held_ball_as_track_does_with_any_paint(tmp_path):
     for name in ("config.txt", "sample.mp4"):
         shutil.copy(SHARED / "real" / "fictrac" / name, tmp_path)
     run = partial(subprocess.run, cwd=tmp_path, check=True, capture_output=True, text=True)

@@ -84,7 +84,7 @@ def test_swapped_movies_are_named(clean, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("keys", "named"), [({"diameter": 18.9}, ", not 18.9"), ({}, "")])
-def test_what_explains_a_contradiction_is_named(clean, tmp_path, keys, named):
+def test_the_cause_of_a_contradiction_is_named(clean, tmp_path, keys, named):
     """Before: a diameter 5 % off gave a warning of the size only."""
     found = of(checked(clean, tmp_path, sphere=PAINTED | keys), "cameras agree")
     assert found.severity is (FAULT if named else OK), found.measured

@@ -68,7 +68,7 @@ def test_the_random_paints_are_good(kind):
         (lambda map_: (map_directions(256)[..., 2] > 0).float(), RADIUS_PX, "smaller patches"),
     ],
 )
-def test_what_is_wrong_with_a_paint_is_named(good, spoil, radius_px, words):
+def test_faults_of_a_paint_are_named(good, spoil, radius_px, words):
     found = judge_contrast(measure_texture(spoil(good)), radius_px)
     assert found.severity is (FAULT if words == "one colour" else WARNING)
     assert words in found.advice

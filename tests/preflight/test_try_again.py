@@ -70,7 +70,7 @@ def test_mask_light_and_field_of_view_are_those_that_are_tried(marking):
     assert not list(marking.path.parent.glob("*mask*")), "nothing is written until it is saved"
 
 
-def test_what_was_tried_is_saved_and_all_else_stays(marking):
+def test_tried_values_are_saved_and_all_else_stays(marking):
     asked = NOTHING | {"circle": [75.25, 74.5, 28.0], "light": {"gamma": 2.2}, "vfov_deg": 25, "shapes": [CORNER]}
     files = marking.done(["adopt", "cam1"], asked)["files"]
     saved = load_experiment(marking.path)

@@ -1,4 +1,4 @@
-"""A browser for pages; a test module asks for it with pytest_plugins = ["browser_examples"].
+"""A browser for pages; a test module uses it by pytest_plugins = ["browser_examples"].
 
 Not in a conftest.py of this folder: that would hide tests/conftest.py from all that import from it.
 """

@@ -68,7 +68,7 @@ def test_the_lowest_score_of_a_run_of_one_flag_is_shown():
     assert list(choose_worst(track, 1)) == [16]
 
 
-def test_what_is_not_in_doubt_is_not_called_bad():
+def test_undoubted_frames_are_not_called_bad():
     bad = choose_worst(true_track(), 5)
     assert len(bad) == 5
     assert next(iter(bad)) == 0  # the lowest score, as planted
@@ -76,7 +76,7 @@ def test_what_is_not_in_doubt_is_not_called_bad():
 
 
 @pytest.mark.parametrize("count", [1, 6, 500])
-def test_frames_are_apart_and_not_more_than_asked(count):
+def test_frames_are_apart_and_not_more_than_the_option_allows(count):
     track = changed(true_track(), slice(0, 40), flags=np.arange(40) % 5 == 0)
     rows = sorted(choose_worst(track, count))
     assert 1 <= len(rows) <= count

@@ -323,7 +323,7 @@ def test_tracks_of_other_times_are_refused(tmp_path):
 
 
 def test_without_a_map_outline_and_axes_are_shown(tmp_path):
-    """A ball whose paint is not known yet is drawn on all the same."""
+    """Outline and axes of a ball without a map are drawn all the same."""
     with ExitStack() as opened:
         page, streams = prepared(true_track(("cam1",)), excerpt().with_sphere(texture_path=None), None, opened)
         _, pictures = next(pictures_by_row(streams, np.array([K])))

@@ -277,7 +277,7 @@ def test_legends_cover_no_data_and_leave_the_page_nowhere(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["densities", *(slow(name) for name in FIGURES if name != "densities")])
-def test_the_same_input_gives_the_same_bytes_whatever_the_users_own_style(name, tmp_path):
+def test_the_same_input_gives_the_same_bytes_with_any_style_of_the_user(name, tmp_path):
     first = plots.write_figure(FIGURES[name](), tmp_path / "first.one")
     with matplotlib.rc_context({"font.size": 20, "lines.linewidth": 7, "axes.facecolor": "yellow", "pdf.fonttype": 3}):
         again = plots.write_figure(FIGURES[name](), tmp_path / "again")
@@ -355,7 +355,7 @@ def test_bands_are_two_standard_deviations_wide():
     assert widths[1] == pytest.approx(2 * 2 * 2.0)  # y rests: 4 standard deviations of 2 mm
 
 
-def test_what_was_measured_is_dots():
+def test_measurements_are_dots():
     track = planted_track()
     axes = plots.track_figure(track).axes[0]
     dots = [line for line in axes.lines if line.get_marker() == "."]
@@ -511,7 +511,7 @@ def test_distances_are_in_degrees_and_their_density_is_one_in_all(outlier_deg):
         assert np.nanmax(values * np.diff(edges)) < 0.3
 
 
-def test_every_pair_of_cameras_has_a_panel_which_without_a_comparison_says_nothing_of_perspective():
+def test_every_pair_of_cameras_has_a_panel_without_a_note_on_perspective_where_nothing_is_compared():
     distance = planted_distance(rough=False)
     figure = plots.camera_distance_figure([distance, replace(distance, cameras=("left", "top"))])
     assert legend_texts(figure)[0].startswith("distance: median 1.2° of 4,000 frames")
@@ -719,7 +719,7 @@ def test_shares_of_noise_are_bars_in_percent_with_intervals_and_the_limit():
     assert len({bar.patches[0].get_hatch() for bar in axes.containers}) == 3
 
 
-def test_what_a_smoother_lost_is_not_called_noise_and_without_any_the_axis_is_linear():
+def test_the_loss_of_a_smoother_is_not_called_noise_and_without_any_the_axis_is_linear():
     [axes] = plots.noise_figure(TABLE, "removed").axes
     assert axes.get_ylabel() == "variance smoothed away (%)"
     [axes] = plots.noise_figure({"velocity": planted_moments("velocity", (0.0, 0.0, 0.0))}).axes

@@ -89,7 +89,7 @@ def test_angles_and_distances_are_in_the_units_of_their_names(written):
     assert (float(angles[0]["from_deg"]), float(angles[-1]["to_deg"])) == pytest.approx((-90, 90))
 
 
-def test_what_was_lost_and_what_the_flow_is(written):
+def test_lost_frames_and_the_flow_are_listed(written):
     (row,) = rows_of(written[0], "tracks")
     assert (row["file"], row["lost"]) == ("a/track.h5", "left: 7; right: 7")
     assert 0 < float(row["stated_error_deg"]) < 5

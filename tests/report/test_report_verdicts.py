@@ -9,7 +9,7 @@ from sphereorient.report.verdicts import verdicts
 from sphereorient.statistics import StatisticsSettings, summarise
 from sphereorient.statistics.cameras import CameraDistance
 
-ACTION = re.compile(r".*; (if this is not meant|see|run|pass|track|read|compute) [^;]*$")  # its end says what to do
+ACTION = re.compile(r".*; (if this is not meant|see|run|pass|track|read|compute) [^;]*$")  # its end is the advice
 FEW = StatisticsSettings(resamples=100)
 
 

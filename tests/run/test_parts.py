@@ -54,7 +54,7 @@ def test_a_folder_of_the_users_is_refused_and_stays(tmp_path):
     assert {path.name for path in request.parts.iterdir()} == {"thesis.txt", "run.json"}
 
 
-def test_what_is_not_of_the_run_stays_when_its_folder_is_emptied(store, tmp_path):
+def test_files_of_others_stay_when_the_folder_of_a_run_is_emptied(store, tmp_path):
     (store.folder / "notes.txt").write_text("mine")
     with store.held(request_to(tmp_path / "track.h5"), resume=False):
         assert store.missing([BATCH]) == [BATCH]

@@ -63,7 +63,7 @@ def test_the_second_gets_doubtful_disks_alone() -> None:
     assert found.reason == (Reason.OK,) * 4
 
 
-def test_in_doubt_the_second_comes_first_and_nothing_comes_twice() -> None:
+def test_for_a_doubtful_disk_the_second_comes_first_and_nothing_comes_twice() -> None:
     found = FallbackProposer(Planted(FIRST), Planted(SECOND), sure=0.75).propose(disks(2))
     # 90 is within 12 degrees of the second's 85, which comes later in turn than the first's 10 but before its 90.
     assert angles(found, 0) == [-60.0, 10.0, 85.0]

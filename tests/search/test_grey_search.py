@@ -216,7 +216,7 @@ def test_every_rotation_lies_within_the_grids_covering_angle_of_a_template():
     covered_deg = ((trace - 1) / 2).clamp(-1, 1).acos().rad2deg()
     step_deg = GreySearchSettings().step_deg
     assert covered_deg.max() <= (0.5 + 0.5**0.5) * step_deg
-    assert covered_deg.max() > 0.7 * step_deg  # and is no finer than it says
+    assert covered_deg.max() > 0.7 * step_deg  # and is no finer than stated
     # The grid itself, in another order; what fills the last group up is there twice.
     grid = so3.lattman_grid(math.radians(step_deg)).float()
     assert len(templates) - len(grid) < 8

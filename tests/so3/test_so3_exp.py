@@ -103,7 +103,7 @@ def test_the_derivative_of_exp_at_0_is_hat():
     assert_close(jacobian.movedim(-1, 0), so3.hat(torch.eye(3, dtype=F64)))
 
 
-def test_what_was_not_measured_stays_nan_and_alone():
+def test_unmeasured_values_stay_nan_and_change_no_others():
     rotvec = torch.tensor([[0.1, 0.2, 0.3], [math.nan] * 3])
     R = so3.exp(rotvec)
     assert R[1].isnan().all()
@@ -125,7 +125,7 @@ def test_compiled_code_gives_what_torch_gives(rng, monkeypatch):
     assert torch.equal(found[1].nan_to_num(9.0), found[2].nan_to_num(9.0))
 
 
-def test_derivatives_are_asked_for_in_any_of_torchs_ways(rng):
+def test_derivatives_work_in_all_ways_of_torch(rng):
     rotvec = torch.randn(4, 3, generator=rng, dtype=F64)
     by_hand = torch.stack([torch.autograd.functional.jacobian(so3.exp, one) for one in rotvec])
     assert float(by_hand.abs().amax()) > 0.1

@@ -107,7 +107,7 @@ def test_only_the_last_row_holds_its_rotations_twice():
     assert apart.min() > math.radians(10)
 
 
-def test_the_grid_comes_in_the_dtype_asked_for_and_always_the_same(dtype, tolerance):
+def test_the_grid_has_the_given_dtype_and_is_always_the_same(dtype, tolerance):
     grid = so3.lattman_grid(STEP, dtype=dtype)
     assert grid.dtype == dtype
     assert torch.equal(grid, so3.lattman_grid(STEP, dtype=dtype))

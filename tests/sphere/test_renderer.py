@@ -69,7 +69,7 @@ def test_from_far_away_a_cameras_picture_is_the_orthographic_one(texture, R):
     assert_close(view(camera.R_cam_lab @ R), there, atol=1e-4)
 
 
-def test_paint_and_background_have_the_levels_and_the_area_asked_for():
+def test_paint_and_background_have_their_given_levels_and_area():
     camera, position = near_camera(), f64(POSITIONS)
     R = torch.eye(3, dtype=torch.float64)
     render = SphereRenderer(torch.ones(8, 16), radius_mm=9.0, camera=camera)
@@ -141,7 +141,7 @@ def test_a_sphere_beyond_the_edge_is_cut_off_there(texture):
         assert_close(here, there[100:148, 100:148], atol=1e-9)
 
 
-def test_what_cannot_be_rendered_is_refused(texture, R):
+def test_impossible_scenes_are_refused(texture, R):
     with pytest.raises(SettingsError, match="got neither"):
         SphereRenderer(texture)
     with pytest.raises(SettingsError, match="got both"):

@@ -216,7 +216,7 @@ def test_gradients_are_right_in_the_orientation_and_in_the_map(rng):
 
 def test_the_pictures_slope_is_the_turning_of_the_map(rng):
     # Grey = latitude: turning about the view's x axis by a small angle moves the paint along the meridian through the
-    # disk's middle by that angle, whatever the interpolation.
+    # disk's middle by that angle, with any interpolation.
     height = 180
     latitude = math.pi / 2 - math.pi * (torch.arange(height, dtype=torch.float64) + 0.5) / height
     texture = latitude[:, None].expand(height, 2 * height)
@@ -259,6 +259,6 @@ def test_a_batch_is_the_stack_of_its_singles(rng, dtype, tolerance, batch):
         assert_close(render(R), expected, atol=20 * tolerance)
 
 
-def test_what_is_no_rotation_matrix_is_refused(rng):
+def test_a_matrix_that_is_no_rotation_is_refused(rng):
     with pytest.raises(ShapeError, match="R_view_body"):
         orthographic_view(8).render(random_map(rng), torch.zeros(3, 4))

@@ -230,7 +230,7 @@ def test_smoothing_keeps_the_gain_of_a_ball_that_an_animal_turns():
     assert float(off.median()) < 2.5 * sigma
 
 
-def test_a_smoother_that_loses_motion_shows_it_whatever_the_noise_of_the_reference():
+def test_a_smoother_that_loses_motion_shows_it_at_any_noise_of_the_reference():
     rng, turns = np.random.default_rng(3), turns_of(4000)
     theirs = moved(errors(4000, rng, 0.0, 8e-3), turned(turns))
     track = track_of(turned(turns), orientation_smooth=turned(0.98 * turns))

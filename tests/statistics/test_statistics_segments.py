@@ -72,7 +72,7 @@ def test_part_of_an_ensemble_has_the_segments_in_order():
         ([track([60, 60]), track([60, 60], method="paper")], "one method"),
     ],
 )
-def test_what_cannot_be_a_sample_is_refused_in_one_line(tracks, words):
+def test_an_impossible_sample_is_refused_in_one_line(tracks, words):
     with pytest.raises(TrackError, match=words) as caught:
         ensemble_of(tracks)
     assert "\n" not in str(caught.value)

@@ -70,7 +70,7 @@ def test_an_unknown_name_is_refused_with_the_nearest_one():
         assert "\n" not in str(refused.value)
 
 
-def test_what_does_not_act_on_pictures_is_refused_there():
+def test_degradations_that_do_not_act_on_pictures_are_refused_there():
     with pytest.raises(SettingsError, match="write_degraded"):
         only("spin", 5.0, ball())
 
@@ -84,7 +84,7 @@ def test_impossible_values_are_refused(name, value):
         only(name, value, ball())
 
 
-def test_what_is_no_picture_is_refused():
+def test_impossible_arguments_are_refused():
     for wrong in (torch.zeros(5), torch.zeros(5, 5, dtype=torch.uint8)):
         with pytest.raises(ShapeError, match="pass grey levels as floats"):
             degrade(wrong, disk(), {}, seeded())
@@ -273,7 +273,7 @@ def test_occlusion_hides_its_share_of_the_disk(share):
         assert float(hidden.sum()) <= math.pi * RADIUS**2 * 1.01  # as large as the ball
 
 
-def test_bubbles_are_as_many_as_said_before_the_disk():
+def test_the_number_of_bubbles_before_the_disk_is_the_severity():
     white = torch.full((500, 500), 100.0)
     where = Disk(centre_px=torch.tensor([250.0, 250.0]), radius_px=torch.tensor(230.0))
     for count in (2, 5):
@@ -314,7 +314,7 @@ def test_a_gain_never_darkens_and_needs_white_paint():
     assert_close(gain_to_clip(grey, white, 1 / 3), torch.tensor([255 / 200, 1.0, 1.0]), atol=1e-6)
 
 
-def test_as_many_frames_are_lost_as_said_others_in_each_movie():
+def test_the_number_of_lost_frames_is_the_severity_and_differs_by_movie():
     lost = lost_frames(torch.empty(3, 40), 0.15, seeded())
     assert (lost.sum(-1) == 6).all()
     assert not torch.equal(lost[0], lost[1])
@@ -322,7 +322,7 @@ def test_as_many_frames_are_lost_as_said_others_in_each_movie():
     assert int(lost_frames(torch.empty(24), 0.02, seeded()).sum()) == 1  # before: none
 
 
-def test_a_wrong_disk_is_wrong_by_what_is_said():
+def test_a_wrong_disk_is_wrong_by_the_severity():
     true = disk((500,), torch.float64)
     off = centre_error(true, 2.0, seeded()).centre_px - true.centre_px
     assert_close(off.norm(dim=-1), torch.full((500,), 2.0, dtype=torch.float64))

@@ -79,7 +79,7 @@ def test_without_degradations_the_files_are_those_of_synth(plain, tmp_path):
 @pytest.mark.parametrize(
     "name", [name for name, row in DEGRADATIONS.items() if row.where in ("picture", "frame", "map", "movie")]
 )
-def test_what_spoils_pictures_spoils_the_movies_and_no_input_file(name, plain, tmp_path):
+def test_degradations_of_pictures_change_the_movies_and_no_input_file(name, plain, tmp_path):
     path = write_degraded(tmp_path, SETTINGS, {name: 5})
     assert same_truth(path, plain)
     for same in ("experiment.yaml", "cameras.yaml", "texture.png"):

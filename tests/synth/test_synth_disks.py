@@ -178,7 +178,7 @@ def test_a_degradation_of_pictures_changes_them_and_more_so_the_harder_it_is(nam
 
 @pytest.mark.usefixtures("noiseless")
 @pytest.mark.parametrize("name", ["motion_blur", "ball_size", "defocus"])
-def test_what_blurs_makes_pictures_less_sharp(name, rng):
+def test_blurs_make_pictures_less_sharp(name, rng):
     """Steps between neighbours in the middle of the disks, rms, grey levels."""
     texture, R = random_texture("blobs", 2, 128), so3.random_rotations(48, generator=rng).float()
     plain, mild, hard = (

@@ -72,7 +72,7 @@ def found() -> WearSeries:
 def test_worn_places_are_found_where_they_were_planted_in_the_first_maps_frame():
     for k, wear in enumerate(found().wear, start=1):
         first, later = RADII_DEG[k]
-        # Within a degree of the rim it could be displaced paint; half a degree is what the maps may be displaced.
+        # Within a degree of the rim it could be displaced paint; the maps may be displaced by half a degree.
         inside = near(FIRST_SPOT, first - 2.5) | (near(LATER_SPOT, later - 2.5) & (later > 0))
         outside = ~near(FIRST_SPOT, first + 2.5) & ~(near(LATER_SPOT, later + 2.5) & (later > 0))
         assert wear.worn[inside].double().mean() > 0.99
@@ -130,7 +130,7 @@ def test_unseen_paint_is_neither_worn_nor_healed():
     assert not series.wear[1].worn.any()
     growth = series.growth
     assert growth[1].known == pytest.approx(1 - 0.5 * (1 - math.cos(math.radians(25))), abs=0.005)
-    assert growth[2].stays != growth[2].stays, "nothing was worn in the map before, as far as that one knows"
+    assert growth[2].stays != growth[2].stays, "no cell was worn in the map before, where it shows paint"
 
 
 def test_places_are_one_across_the_maps_edge_and_over_its_poles():

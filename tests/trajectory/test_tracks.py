@@ -23,7 +23,7 @@ def same(one: Trajectory, other: Trajectory) -> None:
     assert (one.provenance, one.settings, one.frame_rate) == (other.provenance, other.settings, other.frame_rate)
 
 
-def test_what_is_written_of_each_ball_is_read_in_the_same_order(tmp_path: Path) -> None:
+def test_balls_are_read_in_the_order_in_which_they_were_written(tmp_path: Path) -> None:
     several().save(tmp_path / "track.h5")
     read = Tracks.load(tmp_path / "track.h5")
     assert list(read) == ["b", "a", "c"]

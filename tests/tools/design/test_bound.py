@@ -64,7 +64,7 @@ def test_rotations_about_view_x_move_a_horizontal_border():  # convention
     north = (map_directions(512)[..., 2] > 0).float()
     found = cramer_rao_bound(north, face(), diameter_px=60, sampling=GREY[0.5]).information.diagonal()
     assert float(found[0]) > 50 * float(found[1])  # a horizontal line rolls up and down about x, and not about y
-    assert float(found[4]) > 1.5 * float(found[3])  # v sees the line and the outline, u the outline alone
+    assert float(found[4]) > 1.5 * float(found[3])  # v depends on line and outline, u on the outline alone
 
 
 @pytest.mark.slow
@@ -192,7 +192,7 @@ def test_covariance_is_the_inverse_of_information_in_any_units():
     assert_close(covariance @ information, torch.eye(6, dtype=torch.float64), atol=1e-9)
 
 
-def test_what_is_no_picture_is_refused(patches):
+def test_impossible_arguments_are_refused(patches):
     with pytest.raises(SettingsError, match="noise_share"):
         cramer_rao_bound(patches, face(), diameter_px=24, noise_share=0.0)
     with pytest.raises(ShapeError, match="R_view_body"):

@@ -33,7 +33,7 @@ FEW = DesignSettings(diameter_px=24, views=12)
 
 
 def bands(width_deg: float, height: int = 360) -> torch.Tensor:
-    """Rings about the axis, as wide as said, painted in turn from the equator on."""
+    """Rings about the axis, of given width, painted in turn from the equator on."""
     latitude = torch.rad2deg(torch.asin(map_directions(height)[..., 2]))
     return ((latitude / width_deg).floor() % 2).float()
 
@@ -58,7 +58,7 @@ def test_a_direction_faces_the_camera_with_north_up_and_east_right():  # convent
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [12.0, 20.0])
 def test_rings_take_a_brush_of_their_width(width):  # oracle
-    # A brush as wide as a ring just fits; the lattice of points knows widths to a degree or two.
+    # A brush as wide as a ring just fits; the lattice of points gives widths to a degree or two.
     assert stroke_deg(bands(width)) == pytest.approx(width, abs=2.0)
 
 

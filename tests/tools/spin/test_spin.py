@@ -101,7 +101,7 @@ def test_the_sigma_of_the_rate_is_the_scatter_over_many_draws():
     found = [fit_spins(candidates(omega, time_s, scatter_deg=5.0, wrong=0, seed=s)[0], 0.5 * TURN) for s in range(24)]
     rates = torch.stack([spins.omega_view_rad_s[0].norm() for spins in found])
     stated = torch.stack([spins.rate_sigma()[0] for spins in found]).square().mean().sqrt()
-    # 24 draws know their scatter to 15 %; the sigma itself is from 10 pictures.
+    # 24 draws give their scatter to 15 %; the sigma itself is from 10 pictures.
     assert float(rates.std() / stated) == pytest.approx(1.0, abs=0.4)
 
 
