@@ -236,7 +236,7 @@ def test_the_command_writes_table_and_figure_and_prints_a_row_for_each_point(tmp
     ],
 )
 def test_bad_numbers_are_one_line(tmp_path, monkeypatch, capsys, arguments, words):
-    code, _, said = command(monkeypatch, capsys, "bench", "balls", "--out", tmp_path / "run", *arguments)
-    assert code == 2, said
-    assert len(said.strip().splitlines()) == 1
-    assert words in said
+    code, _, errors = command(monkeypatch, capsys, "bench", "balls", "--out", tmp_path / "run", *arguments)
+    assert code == 2, errors
+    assert len(errors.strip().splitlines()) == 1
+    assert words in errors

@@ -262,10 +262,10 @@ def test_the_papers_method_on_a_small_run(tmp_path):
     ],
 )
 def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, words):
-    code, _, said = command(monkeypatch, capsys, "bench", "robustness", "--out", tmp_path / "run", *arguments)
+    code, _, errors = command(monkeypatch, capsys, "bench", "robustness", "--out", tmp_path / "run", *arguments)
     assert code == 2
-    assert len(said.strip().splitlines()) == 1
-    assert words in said
+    assert len(errors.strip().splitlines()) == 1
+    assert words in errors
 
 
 def test_a_file_names_the_scenes_and_an_option_wins(tmp_path, monkeypatch, capsys):
@@ -283,9 +283,9 @@ def test_a_file_names_the_scenes_and_an_option_wins(tmp_path, monkeypatch, capsy
     )
     assert [(scene.name, scene.plan.frames) for scene in seen] == [("clean-0-0-0", 15), ("defocus-4-0-0", 15)]
     config.write_text("level: [2]\n")
-    code, _, said = command(monkeypatch, capsys, "bench", "scenes", "--out", out, "--settings", config)
-    assert (code, len(said.strip().splitlines())) == (2, 1)
-    assert "write 'levels'" in said
+    code, _, errors = command(monkeypatch, capsys, "bench", "scenes", "--out", out, "--settings", config)
+    assert (code, len(errors.strip().splitlines())) == (2, 1)
+    assert "write 'levels'" in errors
 
 
 def test_compare_as_a_command(tmp_path, monkeypatch, capsys):

@@ -229,7 +229,7 @@ def test_boards_are_read_as_calibration_yaml_defines_them() -> None:
 
 
 @pytest.mark.parametrize(
-    ("entry", "said"),
+    ("entry", "words"),
     [
         ({"type": "chessboard", "columns": 2, "rows": 6, "pitch": 10.0}, "3 x 3 inner corners or more"),
         ({"type": "charuco", "columns": 8, "rows": 6, "pitch": 10.0, "marker": 12.0}, "smaller than its square"),
@@ -249,6 +249,6 @@ def test_boards_are_read_as_calibration_yaml_defines_them() -> None:
         ),
     ],
 )
-def test_an_impossible_board_is_refused(entry: dict[str, object], said: str) -> None:
-    with pytest.raises(CameraError, match=said):
+def test_an_impossible_board_is_refused(entry: dict[str, object], words: str) -> None:
+    with pytest.raises(CameraError, match=words):
         plate_from_entry(entry)

@@ -147,15 +147,15 @@ def test_squares_bars_and_half_disks_are_no_dots() -> None:
 
 
 @pytest.mark.parametrize(
-    ("picture", "said"),
+    ("picture", "words"),
     [
         (np.zeros((40, 40, 3)), r"plate picture: expected \(H, W\)"),
         (np.zeros((4, 40)), "of 16 px or more"),
         (np.full((40, 40), np.nan), "got NaN"),
     ],
 )
-def test_an_array_that_is_no_grey_picture_is_refused_in_one_line(picture: np.ndarray, said: str) -> None:
-    with pytest.raises(CameraError, match=said) as refused:
+def test_an_array_that_is_no_grey_picture_is_refused_in_one_line(picture: np.ndarray, words: str) -> None:
+    with pytest.raises(CameraError, match=words) as refused:
         find_dots(picture)
     assert "\n" not in str(refused.value)
 

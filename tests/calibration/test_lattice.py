@@ -217,7 +217,7 @@ def test_a_plate_is_read_as_calibration_yaml_defines_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "words"),
     [
         ({"columns": 0}, "plate, columns: expected a whole number"),
         ({"rows": 9.5}, "plate, rows: expected a whole number"),
@@ -232,8 +232,8 @@ def test_a_plate_is_read_as_calibration_yaml_defines_it() -> None:
         ({"pich": 8.0}, "unknown pich"),
     ],
 )
-def test_an_impossible_plate_is_refused_in_one_line(change: dict[str, object], said: str) -> None:
-    with pytest.raises(CameraError, match=said) as refused:
+def test_an_impossible_plate_is_refused_in_one_line(change: dict[str, object], words: str) -> None:
+    with pytest.raises(CameraError, match=words) as refused:
         plate_from_entry({**ENTRY, **change})
     assert "\n" not in str(refused.value)
 
@@ -251,13 +251,13 @@ def test_pictures_of_a_laboratory_are_indexed_right_to_the_last_dot(folder: str)
     from sphereorient.cameras import load_cameras
 
     place = SHARED / folder / "calibration"
-    said = yaml.safe_load((place / "calibration.yaml").read_text())
-    plate, cameras = plate_from_entry(said["plate"]), load_cameras(SHARED / folder / "cameras.yaml")
+    document = yaml.safe_load((place / "calibration.yaml").read_text())
+    plate, cameras = plate_from_entry(document["plate"]), load_cameras(SHARED / folder / "cameras.yaml")
     assert isinstance(plate, DotPlate)
     with h5py.File(place / "truth.h5") as truth:
         R, T = (torch.from_numpy(truth[name][:]) for name in ("R_lab_plate", "T_lab_plate"))
     misses = []
-    for entry in said["pictures"][3:14:5]:
+    for entry in document["pictures"][3:14:5]:
         k = entry["pose"]
         for name in (name for name in cameras if name in entry):
             view = see_plate(cv2.imread(str(place / entry[name]), cv2.IMREAD_UNCHANGED), plate, entry[name])

@@ -151,12 +151,12 @@ def test_the_command_marks_doubtful_cameras_and_writes_no_hopeless_ones(tmp_path
     monkeypatch.setattr(sys, "argv", ["sphereorient", "calibrate", str(tmp_path / "calibration.yaml"), "-o", str(out)])
     with pytest.raises(SystemExit) as stop:
         cli.main()
-    printed, said = capsys.readouterr()
+    printed, errors = capsys.readouterr()
     if hopeless:
         assert stop.value.code == 2
-        assert said.strip().splitlines()[-1].startswith("sphereorient: ")  # after the lines of progress
-        assert "got cam1: residuals of neighbouring points agree" in said
-        assert "30 of 300 points were dropped" in said
+        assert errors.strip().splitlines()[-1].startswith("sphereorient: ")  # after the lines of progress
+        assert "got cam1: residuals of neighbouring points agree" in errors
+        assert "30 of 300 points were dropped" in errors
         assert not out.exists()
         return
     assert not stop.value.code

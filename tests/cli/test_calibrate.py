@@ -38,7 +38,7 @@ def track_of(calibrated, truly, contradicts=0):
     rng = torch.Generator().manual_seed(6)
     places = 20 * (2 * torch.rand(FRAMES, 3, generator=rng).double() - 1)
     R = so3.exp(2 * torch.randn(FRAMES, 3, generator=rng).double())
-    says = {}
+    alone = {}
     for name, true in truly.items():
         centre = true.project(places) + 0.02 * torch.randn(FRAMES, 2, generator=rng).double()
         turn = calibrated[name].R_cam_lab.mT @ true.R_cam_lab
@@ -46,14 +46,14 @@ def track_of(calibrated, truly, contradicts=0):
         reason = [Reason.OK] * FRAMES
         if name == "cam2":
             reason[:contradicts] = [Reason.CONTRADICTS] * contradicts
-        says[name] = replace(
+        alone[name] = replace(
             CameraTrack.empty(FRAMES),
             centre_px=centre.numpy(),
             orientation=(wobble @ turn @ R).numpy(),
             reason=tuple(str(why) for why in reason),
         )
-    empty = Trajectory.empty(np.arange(FRAMES) / 600.0, cameras=tuple(says), frame_rate=600.0, experiment="test")
-    return replace(empty, cameras=says)
+    empty = Trajectory.empty(np.arange(FRAMES) / 600.0, cameras=tuple(alone), frame_rate=600.0, experiment="test")
+    return replace(empty, cameras=alone)
 
 
 @pytest.mark.slow

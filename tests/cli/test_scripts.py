@@ -48,10 +48,10 @@ def test_help_and_the_example_are_those_of_the_command(script, name, command):
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_a_file_that_is_not_there_is_one_line(script, tmp_path, name):
     more = [TRUTH] if name == "evaluate_track" else []
-    code, _, said = script(name, tmp_path / "none.h5", *more)
+    code, _, errors = script(name, tmp_path / "none.h5", *more)
     assert code == 2
-    assert len(said.strip().splitlines()) == 1
-    assert "none.h5" in said
+    assert len(errors.strip().splitlines()) == 1
+    assert "none.h5" in errors
 
 
 @pytest.mark.slow
@@ -80,5 +80,5 @@ def test_the_planted_errors_of_a_track_are_printed(script, tmp_path):
     assert code == 0
     assert "40 of 40" in printed
     assert "0.2500" in printed.split()
-    code, _, said = script("evaluate_track", TRUTH, TRUTH)
-    assert (code, len(said.strip().splitlines())) == (2, 1)
+    code, _, errors = script("evaluate_track", TRUTH, TRUTH)
+    assert (code, len(errors.strip().splitlines())) == (2, 1)

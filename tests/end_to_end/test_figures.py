@@ -18,12 +18,12 @@ NOT_MEASURED = {
 
 def test_each_page_with_numbers_is_named_in_figures_md():
     named = {page for figure in figures.FIGURES.values() for page in figure.pages}
-    said = (REPO / "docs" / "figures.md").read_text()
+    text = (REPO / "docs" / "figures.md").read_text()
     for page in sorted((REPO / "docs").glob("*.md")):
         rows = re.findall(r"^\|.*\d\.\d.*\|$", page.read_text(), re.MULTILINE)
         if len(rows) > 1 and page.name not in NOT_MEASURED | {"figures.md"}:
             assert page.name in named, page
-            assert f"[{page.name}]" in said, page
+            assert f"[{page.name}]" in text, page
 
 
 def test_each_mark_is_one_pair_and_each_command_is_there():

@@ -180,8 +180,8 @@ def test_a_full_disk_ends_in_one_line_and_no_movie_is_half_made(tmp_path):
     full = {"preexec_fn": lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, 500_000))}
     run = subprocess.run(script, capture_output=True, text=True, **full)
     assert run.returncode == 1
-    said = run.stderr.strip().splitlines()
-    assert [line for line in said if line.startswith("reproduce_paper.py: ")] == said[-1:], said
+    errors = run.stderr.strip().splitlines()
+    assert [line for line in errors if line.startswith("reproduce_paper.py: ")] == errors[-1:], errors
     assert [path.name for path in (tmp_path / "movies").iterdir() if not path.name.endswith(".part")] == []
 
 

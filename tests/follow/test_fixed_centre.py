@@ -66,9 +66,9 @@ def test_frames_that_are_far_off_hardly_move_the_mean_position():
 
 def test_measurements_that_scatter_by_more_than_they_state_weigh_less():
     X, covariance = scattered(trials=1, count=12)
-    _, said = mean_place(X[0], covariance)
+    _, stated = mean_place(X[0], covariance)
     _, wider = mean_place(5 * X[0], covariance)
-    assert float(wider.diagonal().sum() / said.diagonal().sum()) > 5
+    assert float(wider.diagonal().sum() / stated.diagonal().sum()) > 5
 
 
 def test_a_single_frame_gives_the_position_with_its_own_error():

@@ -154,12 +154,12 @@ def test_cameras_disagree_where_their_own_turns_are_apart_by_more_than_usual_and
     x = f64([1.0, 0.0, 0.0])
 
     def disagree(first: float, second: float, sigma: float = 1e-3, both: bool = True) -> bool:
-        said = SimpleNamespace(
+        fit = SimpleNamespace(
             own_turn=torch.stack([first * x, second * x])[None],
             own_covariance=(sigma**2 * torch.eye(3, dtype=torch.float64)).expand(1, 2, 3, 3),
         )
         tracker = SimpleNamespace(usual_apart_rad=0.002)
-        return bool(BallTracker.contradictory(tracker, said, torch.tensor([[True, both]])))
+        return bool(BallTracker.contradictory(tracker, fit, torch.tensor([[True, both]])))
 
     assert disagree(0.006, -0.006)
     assert not disagree(0.006, 0.006), "both would turn the pose alike"

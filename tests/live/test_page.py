@@ -232,7 +232,7 @@ def test_a_person_looks_and_stops(served, browser: Any, tmp_path: Path):
     tab = browser.new_page(viewport={"width": 1280, "height": 800})
     wrong: list[str] = []
     tab.on("pageerror", lambda error: wrong.append(str(error)))
-    tab.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+    tab.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
     tab.on(
         "request", lambda asked: None if asked.url.startswith((f"http://{HOST}", "data:")) else wrong.append(asked.url)
     )

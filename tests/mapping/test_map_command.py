@@ -58,10 +58,10 @@ def attitude_errors_deg(track: Path, experiment: Path) -> np.ndarray:
 def test_a_map_is_learnt_written_and_tracked_with(rendered, tmp_path_factory, monkeypatch, capsys):
     scene = tmp_path_factory.mktemp("learnt")
     out = scene / "learnt.png"
-    code, said, err = run(monkeypatch, capsys, "map", rendered, "--out", out, *QUICK)
+    code, output, err = run(monkeypatch, capsys, "map", rendered, "--out", out, *QUICK)
     assert code == 0, err
     for words in ("seen:", "loops:", "iterations: 4", "correlation", "texture: learnt.png"):
-        assert words in said
+        assert words in output
     texture, seen = load_texture(out), read_seen(seen_path(out))
     assert seen is not None
     assert seen.shape == texture.shape
@@ -89,10 +89,10 @@ def test_an_old_map_is_corrected_and_keeps_its_frame_and_what_is_never_seen(copy
     save_map(warped(true, 1.5), folder / "old.png")
     rewrite(copy, frames=[0, 12])  # too few for all of the ball
     options = ("--init", folder / "old.png", "--out", folder / "new.png", *QUICK)
-    code, said, err = run(monkeypatch, capsys, "map", copy, *options)
+    code, output, err = run(monkeypatch, capsys, "map", copy, *options)
     assert code == 0, err
-    assert "against" in said
-    assert "from the old map" in said
+    assert "against" in output
+    assert "from the old map" in output
     assert (folder / "new_moved.png").is_file()
     new, seen = load_texture(folder / "new.png"), read_seen(folder / "new_seen.png")
     assert seen is not None
@@ -210,9 +210,9 @@ def test_two_maps_are_compared_and_wear_is_drawn(tmp_path, monkeypatch, capsys):
     save_map(paint, tmp_path / "old.png")
     save_map(turned_map(paint, Q.mT), tmp_path / "new.png")
     arguments = ("compare-maps", tmp_path / "new.png", tmp_path / "old.png", "--out", tmp_path / "moved.png")
-    code, said, err = run(monkeypatch, capsys, *arguments, "--json")
+    code, output, err = run(monkeypatch, capsys, *arguments, "--json")
     assert code == 0, err
-    printed = json.loads(said)
+    printed = json.loads(output)
     assert np.allclose(printed["R_new_old"], Q.numpy(), atol=2e-3)
     assert printed["moved_rms_deg"] < 0.2
     assert printed["changed_share"] < 0.01

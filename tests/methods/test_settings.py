@@ -326,10 +326,10 @@ def test_a_method_reads_the_keys_that_the_settings_name_for_it_and_no_other(meth
         monkeypatch.setattr(model, "__getattribute__", noting)
     excerpt = REPO / "synthetic_data" / "excerpt" / "experiment.yaml"
     run(Request(experiment=excerpt, method=method), MemoryStore())
-    said = {key for key in READERS if is_read(key, method)}
-    assert read - said == set()
+    stated = {key for key in READERS if is_read(key, method)}
+    assert read - stated == set()
     # Not needed by this movie: no checkpoint, no ball that is held in place, no gap in which cameras change places.
-    assert {key for key in said - read if key.partition(".")[0] != "propose"} <= {
+    assert {key for key in stated - read if key.partition(".")[0] != "propose"} <= {
         "locate.background_frames",
         "assemble.repair_margin",
     }

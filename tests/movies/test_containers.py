@@ -42,9 +42,9 @@ def remark(movie: Any, word: str) -> list[str]:
 def test_uneven_time_stamps_are_the_movies_times_with_a_remark(tmp_path, suffix, codec, tick_s):
     movie = open_movie(stamped(tmp_path / f"movie{suffix}", JITTER_S, codec))
     assert movie.times_s == pytest.approx(JITTER_S, abs=0.51 * tick_s)
-    (said,) = remark(movie, "not even")
-    assert "after frame 5" in said
-    assert f"{1e3 * tick_s:.3g} ms" in said
+    (line,) = remark(movie, "not even")
+    assert "after frame 5" in line
+    assert f"{1e3 * tick_s:.3g} ms" in line
     assert not remark(movie, "truncated")
     assert movie.sample([7])[0].shape == (38, 52)
 

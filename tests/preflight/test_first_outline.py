@@ -78,15 +78,15 @@ def test_an_outline_is_right_or_doubtful_or_none(tmp_path, hidden, rim):
 def test_text_figure_and_files_name_one_outline(tmp_path):
     movie, out = film(tmp_path / "ball.npy", 0.45, rim=1.0, wall=True), tmp_path / "experiment.yaml"
     more = ["--vfov", "30", "--set", "frame_rate=100", "--set", "sphere.diameter=null"]
-    said = CliRunner().invoke(app, ["init", str(movie), "--out", str(out), *more]).output
+    printed = CliRunner().invoke(app, ["init", str(movie), "--out", str(out), *more]).output
     look = seen(movie)
     assert look.doubtful
     assert look.outline is not None
-    assert f"ball of {2 * look.outline.radius_px:.1f} px" in said
+    assert f"ball of {2 * look.outline.radius_px:.1f} px" in printed
     assert look.diameter_px == pytest.approx(2 * look.outline.radius_px)
-    assert "DOUBTFUL" in said
-    assert f"sphereorient mark {out}" in said
-    assert "write in experiment.yaml: circles" in said, "without it the ball is not found"
+    assert "DOUBTFUL" in printed
+    assert f"sphereorient mark {out}" in printed
+    assert "write in experiment.yaml: circles" in printed, "without it the ball is not found"
     out.write_text(out.read_text().replace("#circles", "circles"))
     assert load_experiment(out).circles["cam1"] == pytest.approx(look.outline.circle, abs=0.06)
 

@@ -67,8 +67,8 @@ def two_movies(clean: Example, folder: Path) -> list[Path]:
 
 @pytest.mark.slow
 def test_two_movies_become_an_experiment(clean, tmp_path):
-    said = init(*two_movies(clean, tmp_path), "--out", tmp_path / "experiment.yaml", *ROUND, "-q")
-    assert said == ""
+    printed = init(*two_movies(clean, tmp_path), "--out", tmp_path / "experiment.yaml", *ROUND, "-q")
+    assert printed == ""
     with pytest.raises(CameraError, match=r"cameras.yaml.*`sphereorient calibrate`"):
         load_experiment(tmp_path / "experiment.yaml")
     (tmp_path / "cameras.yaml").symlink_to(clean.folder / "cameras.yaml")
@@ -79,9 +79,9 @@ def test_two_movies_become_an_experiment(clean, tmp_path):
 
 
 def test_unknown_values_are_requested_by_name_in_one_refusal(clean, tmp_path):
-    said = init(*two_movies(clean, tmp_path), "--out", tmp_path / "experiment.yaml")
-    assert re.findall(r"write in experiment.yaml: ([\w.]+),", said) == ["frame_rate", "sphere.diameter"]
-    assert "moves, found in" in said
+    printed = init(*two_movies(clean, tmp_path), "--out", tmp_path / "experiment.yaml")
+    assert re.findall(r"write in experiment.yaml: ([\w.]+),", printed) == ["frame_rate", "sphere.diameter"]
+    assert "moves, found in" in printed
     with pytest.raises(ExperimentError, match=r"frame_rate or times, sphere\.diameter"):
         load_experiment(tmp_path / "experiment.yaml")
 
@@ -102,8 +102,8 @@ def test_the_look_finds_a_ball_that_stays(tmp_path):
     (look,) = look_at([tmp_path / "cam1.mkv"])
     assert look.stays is True
     assert look.diameter_px == pytest.approx(60.0, rel=0.05)
-    said = init(tmp_path / "cam1.mkv", "--out", tmp_path / "new.yaml")
-    assert "fixed, outline" in said
+    printed = init(tmp_path / "cam1.mkv", "--out", tmp_path / "new.yaml")
+    assert "fixed, outline" in printed
 
 
 def test_a_movie_without_a_ball_is_reported(tmp_path):
@@ -181,8 +181,8 @@ def test_a_folder_of_plates_becomes_a_calibration(tmp_path):
     folder, plate = plates(tmp_path / "plates", scenes), Scene().plate
     out = tmp_path / "calibration.yaml"
     known = [f"plate.pitch={plate.pitch_mm}", "pixel_pitch=[0.02, 0.02]", "surveyed.T_lab_plate=[0, 0, 0]"]
-    said = init("--plate", folder, "--out", out, *(word for text in known for word in ("--set", text)))
-    assert re.findall(r"write in calibration.yaml: ([\w.]+),", said) == ["surveyed.R_lab_plate"]
+    printed = init("--plate", folder, "--out", out, *(word for text in known for word in ("--set", text)))
+    assert re.findall(r"write in calibration.yaml: ([\w.]+),", printed) == ["surveyed.R_lab_plate"]
     with pytest.raises(CameraError, match=r"surveyed\.R_lab_plate"):
         load_calibration(out)
     known.append("surveyed.R_lab_plate=[[1,0,0],[0,1,0],[0,0,1]]")
@@ -220,16 +220,16 @@ def test_plate_pictures_are_paired_by_number(tmp_path):
 
 def test_a_folder_without_plates_is_reported(tmp_path):
     cv2.imwrite(str(tmp_path / "a1.png"), np.full((100, 120), 90, np.uint8))
-    said = init("--plate", tmp_path, "--out", tmp_path / "calibration.yaml")
-    assert "no dots found in 1 pictures" in said
+    printed = init("--plate", tmp_path, "--out", tmp_path / "calibration.yaml")
+    assert "no dots found in 1 pictures" in printed
 
 
 def test_fictrac_is_taken_over(clean, tmp_path):
     two_movies(clean, tmp_path)
     (tmp_path / "config.txt").write_text(CONFIG)
-    said = read_fictrac_config(tmp_path / "config.txt")
-    assert said.circle_px == pytest.approx((0.0, 0.0, 10.0), abs=1e-9)
-    assert [len(one) for one in said.ignored] == [3, 4]
+    fictrac = read_fictrac_config(tmp_path / "config.txt")
+    assert fictrac.circle_px == pytest.approx((0.0, 0.0, 10.0), abs=1e-9)
+    assert [len(one) for one in fictrac.ignored] == [3, 4]
     init("--from-fictrac", tmp_path / "config.txt", "--out", tmp_path / "experiment.yaml")
     experiment = load_experiment(tmp_path / "experiment.yaml")
     camera = experiment.cameras["cam1"]
@@ -253,8 +253,8 @@ def test_a_camera_of_fictrac_needs_a_movie_of_the_set_up_and_is_the_source_of_li
     with pytest.raises(SettingsError, match="expected one movie, got 2"):
         init(movie, movie, "--from-fictrac", config, "--out", out)
     assert not out.exists()
-    said = init(movie, "--from-fictrac", config, "--out", out)
-    assert f"sphereorient live {out} --source camera:2" in said
+    printed = init(movie, "--from-fictrac", config, "--out", out)
+    assert f"sphereorient live {out} --source camera:2" in printed
     experiment = load_experiment(out)
     assert experiment.movie_paths["cam1"] == movie
     assert float(experiment.cameras["cam1"].f_px) == pytest.approx(120.0 / math.tan(math.radians(22.5)))
@@ -285,10 +285,10 @@ def test_fictracs_own_rotation_comes_from_its_corners(tmp_path):
     text = CONFIG.replace("c2a_r            : { 0.72, -0.13, -0.46 }", "c2a_src : c2a_cnrs_xy")
     text += "c2a_cnrs_xy      : { 191, 171, 128, 272, 20, 212, 99, 132 }\nc2a_t : { -0.67, 0.39, 2.89 }\n"
     (tmp_path / "config.txt").write_text(text)
-    said = read_fictrac_config(tmp_path / "config.txt")
+    fictrac = read_fictrac_config(tmp_path / "config.txt")
     theirs = so3.exp(torch.tensor([0.722445, -0.131314, -0.460878], dtype=torch.float64))
-    assert math.degrees(float(so3.log(theirs.mT @ said.R_animal_cam((384, 288))).norm())) < 0.001
-    assert said.unread == ("c2a_t",)
+    assert math.degrees(float(so3.log(theirs.mT @ fictrac.R_animal_cam((384, 288))).norm())) < 0.001
+    assert fictrac.unread == ("c2a_t",)
 
 
 @pytest.mark.parametrize("fisheye", [False, True])
@@ -347,8 +347,8 @@ def test_every_key_of_fictrac_is_used_or_named(clean, tmp_path):
     others += " c2a_cnrs_xy c2a_cnrs_yz c2a_cnrs_xz c2a_src c2a_t roi_c roi_r"
     text = CONFIG + "fisheye : n\nthr_rgb_tfrm : grey\n% vfov : 90\n"
     (tmp_path / "config.txt").write_text(text + "".join(f"{key} : 1\n" for key in others.split()))
-    said = init("--from-fictrac", tmp_path / "config.txt", "--out", tmp_path / "experiment.yaml")
-    (line,) = [line for line in said.splitlines() if "not read: " in line]
+    printed = init("--from-fictrac", tmp_path / "config.txt", "--out", tmp_path / "experiment.yaml")
+    (line,) = [line for line in printed.splitlines() if "not read: " in line]
     assert line.partition("not read: ")[2].split(", ") == others.split()
     assert not used & set(others.split())
 

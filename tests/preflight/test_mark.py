@@ -122,14 +122,14 @@ def test_the_server_answers_requests_with_the_token(marking, address):
 
 def test_the_map_is_laid_on_the_ball_as_it_lies_there(marking):
     """The re-rendered ball looks like the picture, at its position."""
-    said = marking.rendered("cam1")
-    assert said["explained"] > 60
-    content = np.frombuffer(base64.b64decode(said["picture"].partition(",")[2]), np.uint8)
+    answer = marking.rendered("cam1")
+    assert answer["explained"] > 60
+    content = np.frombuffer(base64.b64decode(answer["picture"].partition(",")[2]), np.uint8)
     picture = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
-    shown = marking.movies["cam1"].sample([said["frame"]])[0].astype(float)
+    shown = marking.movies["cam1"].sample([answer["frame"]])[0].astype(float)
     assert picture.shape == (*shown.shape, 4)
     inside = picture[..., 3] > 0
-    assert abs(inside.sum() / (np.pi * said["radius"] ** 2) - 1) < 0.05
+    assert abs(inside.sum() / (np.pi * answer["radius"] ** 2) - 1) < 0.05
     assert np.corrcoef(picture[..., 0][inside], shown[inside])[0, 1] > 0.6
 
 
@@ -160,9 +160,9 @@ def test_a_page_of_another_host_gets_nothing(marking, address):
 )
 def test_a_wrong_request_is_reported_and_changes_nothing(marking, address, path, content, words):
     before = sorted(marking.path.parent.iterdir())
-    status, said = ask(f"{address}/{marking.token}/{path}", content)
+    status, answer = ask(f"{address}/{marking.token}/{path}", content)
     assert status == 400
-    assert words in json.loads(said)["error"]
+    assert words in json.loads(answer)["error"]
     assert sorted(marking.path.parent.iterdir()) == before
 
 

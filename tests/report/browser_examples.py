@@ -41,7 +41,7 @@ def opened_page(browser: Any, path: Path, width: int = 1280, **more: Any) -> Ite
     context.set_offline(True)
     page = context.new_page()
     wrong: list[str] = []
-    page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+    page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: wrong.append(str(error)))
     page.on("request", lambda asked: None if asked.url.startswith(("file:", "data:")) else wrong.append(asked.url))
     page.goto(path.as_uri())

@@ -359,8 +359,8 @@ def test_the_command_writes_movie_and_sheet(tmp_path, monkeypatch, capsys):
 def test_the_command_refuses_in_one_line(tmp_path, monkeypatch, capsys, words, message):
     monkeypatch.chdir(tmp_path)
     true_track().save(tmp_path / "track.h5")
-    code, _, said = command(monkeypatch, capsys, "overlay", EXCERPT / "experiment.yaml", "track.h5", *words)
+    code, _, errors = command(monkeypatch, capsys, "overlay", EXCERPT / "experiment.yaml", "track.h5", *words)
     assert code == 2
-    assert message in said
-    assert said.count("\n") == 1
+    assert message in errors
+    assert errors.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["track.h5"]

@@ -129,10 +129,10 @@ def test_the_report_of_a_fixed_ball_has_nothing_on_its_translation(tmp_path):
     assert [one.words for one in found if one.title == "Place"] == [
         "the centre is fixed: this page reports the rotation only"
     ]
-    said = " ".join(f"{one.title} {one.words}" for one in found)
-    assert "velocity" not in said
-    assert "acceleration" not in said
-    assert "Lift" not in said
+    words = " ".join(f"{one.title} {one.words}" for one in found)
+    assert "velocity" not in words
+    assert "acceleration" not in words
+    assert "Lift" not in words
     write_report({"track.h5": still}, tmp_path / "report", settings=FEW)
     page = re.sub("base64,[A-Za-z0-9+/=]+", "", (tmp_path / "report" / "index.html").read_text())
     assert "<title>Rotation of a sphere" in page

@@ -152,14 +152,14 @@ def test_places_are_one_across_the_maps_edge_and_over_its_poles():
 def test_the_command_prints_and_draws_a_series(tmp_path, monkeypatch, capsys):
     paths = [save_map(learnt(k), tmp_path / f"movie{k}.png") for k in range(3)]
     write_seen((~near(FIRST_SPOT, 0.0)).long() * 20, tmp_path / "movie0.png")
-    code, said, err = run(monkeypatch, capsys, "compare-maps", "--series", *paths, "--out", tmp_path / "wear.png")
+    code, output, err = run(monkeypatch, capsys, "compare-maps", "--series", *paths, "--out", tmp_path / "wear.png")
     assert code == 0, err
-    assert "place 1 at longitude 20°, latitude 15°" in said
-    assert "place 2 at longitude -120°, latitude -25°" in said
+    assert "place 1 at longitude 20°, latitude 15°" in output
+    assert "place 2 at longitude -120°, latitude -25°" in output
     assert cv2.imread(str(tmp_path / "wear.png")).shape[1] > 500
-    code, said, err = run(monkeypatch, capsys, "compare-maps", "--series", *paths[:2], "--json")
+    code, output, err = run(monkeypatch, capsys, "compare-maps", "--series", *paths[:2], "--json")
     assert code == 0, err
-    printed = json.loads(said)
+    printed = json.loads(output)
     assert [row["map"] for row in printed["maps"]] == [str(paths[1])]
     assert printed["maps"][0]["stays_share"] is None
     assert [row["worn_share"] for row in printed["maps"]] == pytest.approx(

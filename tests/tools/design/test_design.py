@@ -246,7 +246,7 @@ def test_the_command_judges_makes_and_prints(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "expected"),
     [
         ([], "neither"),
         (["map.png", "--make"], "got both"),
@@ -255,14 +255,14 @@ def test_the_command_judges_makes_and_prints(tmp_path):
         (["--make", "--kinds", "stripes"], "'stripes'"),
     ],
 )
-def test_bad_input_gets_one_line(arguments, says, tmp_path, monkeypatch, capsys):
+def test_bad_input_gets_one_line(arguments, expected, tmp_path, monkeypatch, capsys):
     command = ["sphereorient", "texture", "design", *arguments, "--out", str(tmp_path / "out"), "--quiet"]
     monkeypatch.setattr(sys, "argv", command)
     with pytest.raises(SystemExit) as stopped:
         cli.main()
     assert stopped.value.code == 2
     message = capsys.readouterr().err
-    assert says in message
+    assert expected in message
     assert message.count("\n") == 1
 
 
