@@ -222,7 +222,7 @@ def test_pictures_decide_where_motion_cannot():
     assert flagged(path, Flag.AMBIGUOUS) == [0]
 
 
-def test_a_frame_in_which_the_pictures_are_sure_and_wrong_is_mended_by_the_motion(rng):
+def test_a_frame_with_a_certain_but_wrong_likelihood_is_corrected_by_the_motion(rng):
     R = turning(80, 3.7)
     nll = torch.tensor([0.0, 30.0], dtype=torch.float64).repeat(80, 1)
     nll[40] = torch.tensor([30.0, 0.0])

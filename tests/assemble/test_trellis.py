@@ -187,7 +187,7 @@ def test_a_path_without_edges_and_triples_is_refused():
 
 
 @ORDERS
-def test_gradient_of_the_least_cost_is_one_on_what_the_path_pays(order):
+def test_gradient_of_the_least_cost_is_one_on_the_costs_of_the_path(order):
     costs = random_costs((2, 6), 2, 5, order=order).each(Tensor.requires_grad_)
     path = cheapest(costs)
     path.cost.sum().backward()

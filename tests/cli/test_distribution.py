@@ -69,7 +69,7 @@ def test_the_wheel_tracks_reports_and_exports_without_an_extra(python, tmp_path)
 
 
 @pytest.mark.slow
-def test_wheel_and_source_hold_what_they_should(built):
+def test_wheel_and_source_distribution_hold_the_right_files(built):
     (wheel,), (source,) = built.glob("*.whl"), built.glob("*.tar.gz")
     names = zipfile.ZipFile(wheel).namelist()
     assert all(name.startswith("sphereorient") for name in names)  # no tests, no data

@@ -137,7 +137,7 @@ def test_every_command_that_writes_has_force():
     ],
     ids=["numpy", "torch", "python", "torch on Windows"],
 )
-def test_memory_that_is_not_there_is_one_line(command, monkeypatch, ask):
+def test_missing_memory_is_refused_in_one_line(command, monkeypatch, ask):
     """Before: a traceback and exit code 1; so `track` of the excerpt with 1.3 GB (ulimit -v 1300000)."""
     monkeypatch.setattr("sphereorient.files.provenance.versions", lambda: ask() and {})
     code, errors = command("doctor")

@@ -156,7 +156,7 @@ def test_a_config_gives_the_degradations_of_an_evaluation(checkpoint, tmp_path):
     assert {one["family"] for one in json.loads(run.output)["families"]} == {"bubbles"}
 
 
-def test_the_wrong_things_to_evaluate_are_one_line(checkpoint, config, tmp_path):
+def test_impossible_inputs_of_evaluate_are_one_line(checkpoint, config, tmp_path):
     assert "none.ckpt" in refused("evaluate", tmp_path / "none.ckpt")
     assert "yaml" in refused("evaluate", config)
     (tmp_path / "empty.yaml").write_text("")  # the default: disks of 40 px

@@ -123,7 +123,7 @@ def test_a_training_that_is_finished_can_be_resumed_and_stays(tmp_path):
 
 
 @pytest.mark.slow
-def test_it_goes_on_with_the_same_settings_only_but_may_be_longer(short, tmp_path):
+def test_a_training_resumes_with_the_same_settings_only_but_may_be_longer(short, tmp_path):
     (tmp_path / "last.ckpt").write_bytes((short[1] / "last.ckpt").read_bytes())
     with pytest.raises(CheckpointError, match="same settings"):
         train_proposer(tiny(**SHORT, learning_rate=1e-3), tmp_path, resume=True)
@@ -159,7 +159,7 @@ def test_a_checkpoint_to_begin_with_gives_its_weights(short, tmp_path):
         assert (tuned.checkpoint.state[name] - tensor).abs().max() < 1e-6
 
 
-def test_a_checkpoint_of_another_network_cannot_be_begun_with(short, tmp_path):
+def test_a_checkpoint_of_another_network_is_refused_as_a_start(short, tmp_path):
     tree = {**TINY, "network": {**TINY["network"], "width": 12}, "training": {"start": str(short[1] / "proposer.ckpt")}}
     with pytest.raises(CheckpointError, match="other network settings"):
         train_proposer(ProposerSettings.model_validate(tree), tmp_path / "out")

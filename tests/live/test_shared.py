@@ -52,7 +52,7 @@ def test_a_slot_is_the_pose_as_numbers_in_the_documented_order(tmp_path):
     assert not path.exists()
 
 
-def test_a_reader_that_is_slow_sees_by_the_count_that_it_lost_some(tmp_path):
+def test_a_slow_reader_finds_lost_poses_by_the_count(tmp_path):
     path = tmp_path / "poses"
     with pytest.raises(MovieError, match="expected a ring"):
         next(shared_poses(path))

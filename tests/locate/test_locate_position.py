@@ -172,7 +172,7 @@ def test_where_no_camera_sees_there_is_nothing(count):
 
 
 @pytest.mark.parametrize("flag", [Flag.POSITION_INTERPOLATED, Flag.POSITION_OUTLIER_REPLACED])
-def test_a_frame_that_one_camera_did_not_measure_is_placed_but_not_measured(flag):
+def test_a_frame_that_one_camera_did_not_measure_has_a_position_but_is_not_measured(flag):
     cameras = {"cam1": looking_along_y(), "cam2": looking_down()}
     rms = torch.tensor([0.2, torch.nan, 0.2, 0.2], dtype=torch.float64)
     flags = torch.tensor([0, int(flag), 0, 0])

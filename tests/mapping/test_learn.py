@@ -43,7 +43,7 @@ def opened(path, cameras=None, frames=None):
 
 
 @pytest.mark.slow
-def test_one_camera_of_the_excerpt_teaches_attitudes_and_leaves_the_unseen_empty():
+def test_one_camera_of_the_excerpt_gives_attitudes_and_leaves_unseen_texels_empty():
     with opened(EXCERPT, ["cam1"]) as recording:
         learnt = mapped(recording, QUICK)
     assert bool(learnt.valid.all())

@@ -31,7 +31,7 @@ def truth_of(path: Path) -> tuple[torch.Tensor, torch.Tensor]:
         return torch.from_numpy(file["orientation"][()]), torch.from_numpy(file["position"][()])
 
 
-def test_instants_between_are_turned_as_their_neighbours_were():
+def test_instants_between_known_ones_follow_their_neighbours():
     """The chain drifts evenly; two instants are known, the third lies halfway."""
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     true = so3.exp(torch.arange(5, dtype=torch.float64)[:, None] * torch.tensor([0.3, -0.1, 0.2], dtype=torch.float64))

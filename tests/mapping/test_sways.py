@@ -84,7 +84,7 @@ def test_places_and_turns_are_adjusted_in_each_frame(scene):
 
 
 @pytest.mark.slow
-def test_it_is_tracked_from_nothing(scene):
+def test_a_swaying_ball_is_tracked_without_a_map(scene):
     row = measure_scene(scene.path, SETTINGS, True)
     assert row.refined is not None
     assert row.refined.found == FRAMES

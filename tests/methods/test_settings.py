@@ -374,7 +374,7 @@ def test_only_the_cameras_that_were_used_have_fingerprints_and_inputs_elsewhere_
     assert "experiment.yaml" in kept["sha256"]
 
 
-def test_versions_name_what_enters_the_numbers():
+def test_versions_name_all_packages_that_enter_the_numbers():
     found = versions()
     assert {"python", "sphereorient", "torch", "kornia", "numpy"} <= found.keys()
     assert all(isinstance(number, str) and number for number in found.values())

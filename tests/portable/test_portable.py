@@ -29,7 +29,7 @@ def test_every_module_is_imported_without_posix():
 
 
 @pytest.mark.slow
-def test_files_runs_and_workers_do_without_posix(tmp_path):
+def test_files_runs_and_workers_work_without_posix(tmp_path):
     """Locks, parts, --resume, workers, outputs: the quick tests of these rooms, and two workers on one movie."""
     rooms = [*("tests/files", "tests/run", "tests/cli/test_outputs.py"), "--deselect=tests/run/test_full_disk.py"]
     for words in (["-m", "not slow", *rooms], ["tests/run/test_drive.py", "-k", "two_workers"]):

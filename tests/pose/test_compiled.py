@@ -118,7 +118,7 @@ def test_poses_covariances_and_scores_are_those_of_torch(case):
         assert_as_torch(pixels, model, iterations, nll=nll)
 
 
-def test_residuals_and_what_they_consist_of_are_those_of_torch(case):
+def test_residuals_and_their_parts_are_those_of_torch(case):
     pixels, model, _ = case
     start = begin()
     given = pixels, start.position_lab_mm, start.R_lab_body

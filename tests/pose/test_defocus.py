@@ -32,7 +32,7 @@ def test_the_blur_of_an_edge_is_read_off_its_slope(blur_px, noise):
     assert steepest_blur_px(step(blur_px, noise)) == pytest.approx(blur_px, rel=0.2, abs=0.3)
 
 
-def test_a_picture_of_one_grey_is_not_divided_by_nothing():
+def test_a_picture_of_one_grey_is_not_divided_by_zero():
     assert np.isfinite(steepest_blur_px(np.full((40, 40), 7.0, np.float32)))
 
 

@@ -313,7 +313,7 @@ def test_masked_pixels_do_not_count():
     assert sigma / sigma_all == pytest.approx(math.sqrt(5 / 4), abs=0.08)
 
 
-def test_a_camera_alone_would_not_turn_what_it_has_fitted():
+def test_the_only_camera_has_no_change_by_itself():
     fit = from_truth("one")
     assert_close(fit.own_turn, torch.zeros_like(fit.own_turn), atol=1e-9)
     assert_close(fit.own_move, torch.zeros_like(fit.own_move), atol=1e-6)
@@ -410,7 +410,7 @@ def test_a_pose_that_no_camera_sees_stays_where_it_is_and_the_others_do_not(star
     assert (whole.R_lab_body[3] - R[3]).abs().max() > 1e-3
 
 
-def test_a_pose_whose_start_is_not_a_number_leaves_the_others_alone():
+def test_a_pose_whose_start_is_not_a_number_changes_no_others():
     X, R = truth()
     lost = X.clone()
     lost[3] = torch.nan
@@ -445,7 +445,7 @@ def test_a_prior_pulls_by_its_information():
     assert (fit.covariance[:, 4, 4] < from_truth("one").covariance[:, 4, 4]).all()
 
 
-def test_a_prior_beyond_doubt_holds_the_place_and_one_of_nothing_does_nothing():
+def test_a_strong_prior_holds_the_position_and_a_zero_prior_changes_nothing():
     X, R = truth()
     start = X + f64([0, 0.2, 0.1])
     for precision, expected in ((1e12, start), (1e-6, from_truth("one").position_lab_mm)):

@@ -75,7 +75,7 @@ def test_pictures_not_in_use_change_nothing(pixels):
     assert one.equal(other)
 
 
-def test_a_turn_of_body_and_poses_alike_turns_what_is_worn(pixels):
+def test_a_rotation_of_body_and_poses_rotates_the_worn_cells(pixels):
     """The cells are of the body: the same pictures with another body frame show the same cap elsewhere."""
     worn, fit, model = found(pixels, CAPPED)
     half = so3.exp(torch.tensor([0.0, 0.0, math.pi], dtype=torch.float64))  # about the body's z
@@ -88,7 +88,7 @@ def test_a_turn_of_body_and_poses_alike_turns_what_is_worn(pixels):
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_worn_paint_is_unknown_and_what_was_unknown_stays_so(known):
+def test_worn_paint_becomes_unknown_and_unknown_paint_stays_unknown(known):
     worn = CELL_Z > NORTH
     unseen = None if known else map_directions(len(PAINT))[..., 2] < -0.6
     paint = table(unseen=unseen)

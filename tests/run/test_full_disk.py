@@ -58,7 +58,7 @@ def test_when_there_is_room_again_the_run_goes_on(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_place_that_may_not_be_written_is_one_line(tmp_path):
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
     (tmp_path / "none").touch()
     result = run(EXCERPT, "--out", tmp_path / "none" / "track.h5")
     assert result.returncode == 2

@@ -216,7 +216,7 @@ def test_a_wrong_radius_shrinks_the_ball():
     assert_close(torch.from_numpy(dark_place(film[0])), torch.tensor([0.6 * 39 / 45, 0.0]).double(), atol=0.03)
 
 
-def test_degradations_of_maps_are_left_to_who_holds_the_map(rng):
+def test_degradations_of_maps_change_no_disk(rng):
     texture, R = random_texture("blobs", 2, 64), so3.random_rotations(2, generator=rng).float()
     plain = film_disks(texture, R, {}, seeded(), EXACT)
     assert torch.equal(film_disks(texture, R, {"paint_wear": 0.4, "texture_error": 0.4}, seeded(), EXACT), plain)

@@ -46,7 +46,7 @@ def test_acceleration_is_the_derivative_of_velocity(around):
     assert now.acceleration_m_s2.abs().max() > 1
 
 
-def test_omega_is_what_turns_R_in_lab_components(around):
+def test_omega_rotates_R_in_lab_components(around):
     before, now, after = around
     turn_lab = so3.log(after.R_lab_body @ before.R_lab_body.mT) / (2 * STEP_S)
     assert_close(turn_lab, now.omega_lab_rad_s, atol=2e-3)
