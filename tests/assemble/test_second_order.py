@@ -121,7 +121,7 @@ def test_a_hole_of_twelve_frames_is_one_motion(rng):
 
 def test_false_candidates_beside_the_truth_behind_a_hole_are_not_taken(rng):
     R = turning(100, 3.7)
-    near = turned_deg(R, 25.0, 0.0, 0.0)  # from the truth, less than the turn over the hole
+    near = turned_deg(R, 25.0, 0.0, 0.0)  # from the truth, less than the rotation over the gap
     mask = torch.ones(100, 2, dtype=torch.bool)
     mask[50:62] = False
     path = physical_path(pooled(seen(near, rng), seen(R, rng), mask=mask, nll=[0.0, 0.0]), times(100), SETTINGS)
@@ -179,7 +179,7 @@ def test_a_rotation_by_more_than_half_a_turn_over_a_gap_is_counted_by_omega(rng)
     assert math.degrees(float(path.turn_rad[55].norm())) == pytest.approx(6 * 45.0, abs=2.0)
     assert_close(so3.exp(path.turn_rad[55]) @ path.R_lab_body[49], path.R_lab_body[55], 1e-9)
     shortest = so3.log(path.R_lab_body[55] @ path.R_lab_body[49].mT).norm()
-    assert math.degrees(float(shortest)) < 100  # the reading that takes the shortest turn
+    assert math.degrees(float(shortest)) < 100  # the reading that takes the shortest rotation
 
 
 def test_a_whole_turn_over_a_hole_is_not_taken_for_none(rng):
@@ -196,7 +196,7 @@ def test_turns_are_those_from_the_orientation_before():
     assert torch.isnan(path.turn_rad[[0, 4]]).all()
     assert_close(so3.exp(path.turn_rad[1]), R[1] @ R[0].mT)
     assert_close(so3.exp(path.turn_rad[5]), R[5] @ R[3].mT)
-    assert not torch.allclose(so3.exp(path.turn_rad[5]), R[3].mT @ R[5], atol=1e-4)  # the same turn in body axes
+    assert not torch.allclose(so3.exp(path.turn_rad[5]), R[3].mT @ R[5], atol=1e-4)  # the same rotation in body axes
 
 
 @pytest.mark.parametrize("deg_per_frame", [3.7, slow(22.0)])
@@ -291,7 +291,7 @@ def test_places_that_are_not_in_use_may_hold_anything(rng):
 
 
 def test_uneven_times_are_no_change_of_omega(rng):
-    """A steady turn, sampled with steps of one to three intervals."""
+    """A steady rotation, sampled with steps of one to three intervals."""
     time = torch.randint(1, 4, (120,), generator=rng).cumsum(0) / RATE_HZ
     rate = torch.tensor([0.3, -0.2, 1.0], dtype=torch.float64) * 40
     R = so3.exp(time.double()[:, None] * rate)

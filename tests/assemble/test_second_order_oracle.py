@@ -66,7 +66,7 @@ class Enumeration:
         return self.picture(f, k) * ratio / false
 
     def onward(self, f: int, k: int, state: dict) -> list[tuple[float, np.ndarray]]:
-        """Links from a state to a candidate: ratio of density and turn; none where the motion is lost."""
+        """Links from a state to a candidate: ratio of density and rotation; none where the motion is lost."""
         g, j, dt = state["frame"], state["candidate"], self.time[f] - self.time[state["frame"]]
         if dt > (self.s.gap_frames_max + 1.5) * self.usual:
             return []

@@ -37,7 +37,7 @@ def mended(track: Fused, name: str) -> list[int]:
 
 
 def false_track(R):
-    """A candidate that turns as the truth does, 110 degrees beside it."""
+    """A candidate that rotates as the truth does, 110 degrees beside it."""
     return turned_deg(R, 0.0, 0.0, 110.0)
 
 

@@ -30,7 +30,7 @@ FRAMES = 12
 
 
 def write_truth(path: Path, names: str, apart_mm: float = 30.0) -> dict[str, dict[str, np.ndarray]]:
-    """Balls on a line along x, each turned otherwise."""
+    """Balls on a line along x, each with another rotation."""
     rng = np.random.default_rng(3)
     truth = {
         name: {

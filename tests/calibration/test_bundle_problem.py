@@ -68,7 +68,7 @@ def test_a_change_turns_cameras_in_their_own_frame_and_plates_in_the_lab(rng):
     for same in (0, 1):
         assert_close(moved.R_lab_plate[same], rig.R_lab_plate[same])
     assert_close(moved.cameras["cam1"].R_cam_lab, rig.cameras["cam1"].R_cam_lab)
-    wrong = rig.R_lab_plate[2] @ so3.exp(vector(0.0, 0.0, 0.03))  # the turn read in the plate's frame
+    wrong = rig.R_lab_plate[2] @ so3.exp(vector(0.0, 0.0, 0.03))  # the rotation read in the plate's frame
     assert not torch.allclose(moved.R_lab_plate[2], wrong, atol=1e-4)
 
 

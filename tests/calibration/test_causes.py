@@ -58,7 +58,7 @@ def reported(seen: Seen, cameras: dict[str, Camera]) -> Seen:
 
 
 def turned(camera: Camera, deg: float, axis: int) -> Camera:
-    """Turn a camera about its own centre."""
+    """Rotate a camera about its own centre."""
     turn = so3.exp(math.radians(deg) * torch.eye(3, dtype=torch.float64)[axis])
     assert isinstance(camera, TsaiCamera)
     return replace(camera, R_cam_lab=turn @ camera.R_cam_lab, T_cam_lab_mm=turn @ camera.T_cam_lab_mm)
@@ -94,7 +94,7 @@ def test_a_wrong_diameter_is_named_with_the_right_one(percent):
 
 @pytest.mark.parametrize(("name", "axis"), [("cam1", 1), *(slow(*one) for one in OTHERS)])
 def test_a_turned_camera_is_named(name, axis):
-    """Before: 30 of 30 frames valid with 0.03 degrees stated, whichever camera was turned."""
+    """Before: 30 of 30 frames valid with 0.03 degrees stated, whichever camera was rotated."""
     found = compare_cameras(reported(seen_by(CAMERAS), CAMERAS | {name: turned(CAMERAS[name], 1.5, axis)}), LIMITS)
     assert found.contradicts
     assert f"{name} rotated by 1.5 degrees" in found.advice

@@ -75,7 +75,7 @@ def test_a_rotation_beyond_five_sigmas_is_marked_and_half_of_it_stated():
 
 
 def test_cameras_may_differ_by_what_lasts_in_each_of_them():
-    """Light that a model lacks turns each camera's rotation in its own way, in all frames alike."""
+    """Light that a model lacks changes each camera's orientation in its own way, in all frames alike."""
     track = track_of({"cam1": 1.0}, {})
     own_rad2 = math.radians(0.5) ** 2 * torch.eye(3, dtype=torch.float64).expand(len(CAMERAS), 3, 3)
     marked, _ = with_contradictions(track, CAMERAS, MM, True, own_rad2)

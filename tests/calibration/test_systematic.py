@@ -107,14 +107,14 @@ def test_covariances_are_those_of_brute_force(walls, rng):
 
 
 def test_a_turn_of_both_cameras_turns_the_ball_and_its_place(rng):
-    """By hand: two cameras turned together by a small angle about lab x, and about the lab's origin."""
+    """By hand: two cameras rotated together by a small angle about lab x, and about the lab's origin."""
     rig = cameras(turned_deg=0.0)
     axis = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
     names, columns = [], []
     for name, camera in rig.items():
         in_camera = camera.R_cam_lab @ axis
         names += [f"{name}.rotation_{which}" for which in "xyz"]
-        # X_cam = R X + T with T as it is: R_new = exp(delta) R is the same as lab points turned about the origin.
+        # X_cam = R X + T with T as it is: R_new = exp(delta) R is the same as lab points rotated about the origin.
         columns.append(in_camera)
     direction = torch.cat(columns)
     sigma = 1e-3
@@ -123,7 +123,7 @@ def test_a_turn_of_both_cameras_turns_the_ball_and_its_place(rng):
     computed = systematic_errors(rig, known, place[None], RADIUS)
     expected_turn, expected_move = torch.zeros(3, 3).double(), torch.zeros(3, 3).double()
     expected_turn[0, 0] = sigma**2
-    expected_move[2, 2] = (sigma * 30.0) ** 2  # turned about x, y = 30 goes along z
+    expected_move[2, 2] = (sigma * 30.0) ** 2  # rotated about x, y = 30 goes along z
     assert_close(computed[1][0], expected_turn, atol=1e-10)
     assert_close(computed[0][0], expected_move, atol=1e-8)
 

@@ -72,7 +72,7 @@ def test_a_constant_turn_of_the_body_axes_is_named_and_taken_off(track):
     loaded, turn = Trajectory.load(track), Rotation.from_rotvec([2.0, 1.5, -0.8]).as_matrix()
     with h5py.File(TRUTH) as file:
         rates = {key: file[key][()] for key in ("omega_lab", "omega_body", "alpha_body") if key in file}
-    rates |= {key: rates[key] @ turn for key in ("omega_body", "alpha_body")}  # components in axes that are turned
+    rates |= {key: rates[key] @ turn for key in ("omega_body", "alpha_body")}  # components in axes that are rotated
     off = Rotation.from_rotvec([0.01, 0.0, 0.0]).as_matrix() @ loaded.orientation @ turn
     off[3] = np.nan
     cov = np.tile(np.eye(3) * 0.01**2, (40, 1, 1))
@@ -82,7 +82,7 @@ def test_a_constant_turn_of_the_body_axes_is_named_and_taken_off(track):
     assert "--align body" in plain.stderr
     assert "--align body" not in body.stderr
     found = score_track(Trajectory.load(track), TRUTH, "body")
-    assert found.percentiles_deg()[3] < 1.2  # 0.01 rad in the lab; the turn takes some of it
+    assert found.percentiles_deg()[3] < 1.2  # 0.01 rad in the lab; the rotation takes some of it
     assert found.over_stated()[0] < 1.2
     assert found.relative_rms["omega_body"] == pytest.approx(0.0, abs=0.03)
     assert found.relative_rms["omega_lab"] == pytest.approx(0.0, abs=1e-9)

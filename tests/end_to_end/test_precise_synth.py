@@ -67,7 +67,7 @@ def brisk(rendered: Rendered) -> Movies:
 
 @pytest.fixture
 def held(rendered: Rendered) -> Movies:
-    """120 frames of a ball that turns in one place: frames left out make its orientation jump and nothing else."""
+    """120 frames of a fixed ball: frames left out make its orientation jump and nothing else."""
     return rendered(omega_rms=mean_turn(3.0), velocity_rms=0.0, seed=9)
 
 
@@ -147,7 +147,7 @@ def test_each_camera_also_gives_the_pose_that_it_measures_alone(excerpt, name):
     assert set(excerpt.cameras[name].reason) == {Reason.OK}
 
 
-# Fast turns.
+# Fast rotation.
 
 
 @pytest.mark.slow

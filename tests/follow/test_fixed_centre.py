@@ -101,7 +101,7 @@ def test_attitudes_err_with_the_position_as_follows_states():
 
 @cache
 def in_its_place(folder: Path) -> Path:
-    """A ball that turns in one place before two cameras."""
+    """A fixed ball before two cameras."""
     settings = SynthSettings(
         frames=40, image_size=(150, 150), diameter_px=56.0, volume_mm=8.0, velocity_rms=0.0, exposure=1e-4,
         exposure_samples=1, omega_rms=40.0, seed=5,

@@ -162,7 +162,7 @@ def test_cameras_disagree_where_their_own_turns_are_apart_by_more_than_usual_and
         return bool(BallTracker.contradictory(tracker, fit, torch.tensor([[True, both]])))
 
     assert disagree(0.006, -0.006)
-    assert not disagree(0.006, 0.006), "both would turn the pose alike"
+    assert not disagree(0.006, 0.006), "both would rotate the pose alike"
     assert not disagree(0.003, -0.003), "four times the usual angle are 0.008"
     assert not disagree(0.006, -0.006, sigma=0.005), "no more than their errors"
     assert not disagree(0.006, -0.006, both=False), "one camera"

@@ -410,7 +410,7 @@ TURNS = {90: (0, -1, 1, 0), 180: (-1, 0, 0, -1)}  # of a display matrix
 
 
 def tag(path: Path, angle: int) -> None:
-    """Write a turn into the track header of an MP4 file: players, and OpenCV by default, rotate its pictures."""
+    """Write a rotation into the track header of an MP4 file: players, and OpenCV by default, rotate its pictures."""
     content = bytearray(path.read_bytes())
     a, b, c, d = (value << 16 for value in TURNS[angle])
     at = content.index(b"tkhd") + 44

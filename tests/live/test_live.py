@@ -42,7 +42,7 @@ def test_frames_one_by_one_are_as_good_as_a_whole_run_and_a_black_out_is_reporte
 
 
 def test_a_jump_is_found_and_reported(tmp_path_factory):
-    """From one frame to the next the ball turns by some tens of degrees, forty times as fast as before."""
+    """From one frame to the next the ball rotates by some tens of degrees, forty times as fast as before."""
     order = [*range(12), *range(39, 29, -1)]
     truth = torch.from_numpy(true_track().orientation)
     assert float(so3.geodesic_distance(truth[11], truth[39])) > math.radians(20)
@@ -57,7 +57,7 @@ def test_a_jump_is_found_and_reported(tmp_path_factory):
 
 
 def test_a_jump_needs_no_long_search_and_a_hidden_ball_one_a_second(monkeypatch, tmp_path_factory):
-    """The ball turns by some tens of degrees at once; later something grey without any paint is before it."""
+    """The ball rotates by some tens of degrees at once; later something grey without any paint is before it."""
     asked: list[int] = []
     long_search = BallTracker.searched
     monkeypatch.setattr(BallTracker, "searched", lambda self, frames: asked.append(1) or long_search(self, frames))

@@ -44,7 +44,7 @@ def disks_of_pictures(whole: Tensor, detail: float = 0.06, window: float = 0.3) 
 
 
 def turning(count: int, step_deg: float, axis: tuple[float, float, float] = (0.1, 1.0, 0.2)) -> Tensor:
-    """Attitudes (N, 3, 3) of a ball that turns about one axis, the first one not the identity."""
+    """Attitudes (N, 3, 3) of a ball that rotates about one axis, the first one not the identity."""
     unit = torch.nn.functional.normalize(torch.tensor(axis, dtype=torch.float64), dim=0)
     angle = torch.deg2rad(torch.arange(count, dtype=torch.float64) * step_deg)
     start = so3.exp(torch.tensor([0.3, -0.7, 1.1], dtype=torch.float64))

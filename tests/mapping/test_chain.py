@@ -23,7 +23,7 @@ def turns_of(R, first, second, bias=None):
 
 
 def drifting(R, bias_deg):
-    """Neighbours' turns, each wrong by the same little turn."""
+    """Neighbours' rotations, each wrong by the same small rotation."""
     first = torch.arange(len(R) - 1)
     return turns_of(R, first, first + 1, [0.0, math.radians(bias_deg), 0.0])
 
@@ -84,7 +84,7 @@ def tumbling(count, step_deg):
 
 @pytest.mark.slow
 def test_a_pattern_of_the_sensor_does_not_pull_turns_towards_zero():
-    """Before: turns 0.80 of the true ones, the chain 7.4 degrees off (median); now 0.96 and 1.7."""
+    """Before: rotations 0.80 of the true ones, the chain 7.4 degrees off (median); now 0.96 and 1.7."""
     R = tumbling(90, 4.0)
     dirt = 60 * torch.randn(SIZE, SIZE, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
     disks = disks_of_pictures(pictures(R, 1, "dots") + dirt)

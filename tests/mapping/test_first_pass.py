@@ -178,7 +178,7 @@ def test_frames_that_were_kept_since_an_adjustment_turn_with_it(ball):
     frames.add([ball.frames[0]], far)
     assert (before.count, frames.count) == (late, late + 1)
     R = before.crops()[1]
-    right = [R[0]]  # all turns were 2 % too short
+    right = [R[0]]  # all rotations were 2 % too small
     for one, other in pairwise(R):
         right.append(so3.exp(1.02 * so3.log(other @ one.mT)) @ right[-1])
     expected = so3.exp(1.02 * so3.log(far.R_lab_body[0] @ R[-1].mT)) @ right[-1]

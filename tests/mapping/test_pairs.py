@@ -25,7 +25,7 @@ def test_two_renders_give_the_rotation_without_a_map(cameras, within_deg):
     off = so3.geodesic_distance(turns.R_ji, R[second] @ R[first].mT)
     assert torch.rad2deg(off).max() < within_deg
     assert turns.score.min() > 0.9
-    # The other order of the pair is the other turn.
+    # The other order of the pair is the inverse rotation.
     assert so3.geodesic_distance(turns.R_ji.mT, R[second] @ R[first].mT).min() > 0.2
 
 

@@ -65,7 +65,7 @@ def test_instants_that_do_not_fit_are_found_again_and_the_others_stay(tmp_path):
 
 
 def in_one_place(folder: Path) -> tuple[Path, float]:
-    """One uncalibrated camera, a ball that turns in its place behind a holder; and its distance in radii."""
+    """One uncalibrated camera, a fixed ball behind a holder; and its distance in radii."""
     path = unpainted(folder, **{**SMALL, "velocity_rms": 0.0, "frames": FRAMES, "diameter_px": 60.0, "seed": 3})
     experiment = load_experiment(path)
     camera = experiment.cameras["cam1"]

@@ -1,4 +1,4 @@
-"""Turns between sets of points, against scipy; what markers can and cannot show (docs/errata.md E8)."""
+"""Rotations between sets of points, against scipy; what markers can and cannot show (docs/errata.md E8)."""
 
 import pytest
 import torch

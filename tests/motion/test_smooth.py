@@ -1,4 +1,4 @@
-"""The smoother on planted motion: figures, honest sigmas, gaps, ends, fast turns, wrong frames, laws."""
+"""The smoother on planted motion: figures, sigmas, gaps, ends, fast rotation, wrong frames, laws."""
 
 import math
 from dataclasses import fields, replace
@@ -394,7 +394,7 @@ def test_a_slow_share_adds_its_part_of_the_measured_variance_to_the_covariances_
 
 # orientations given the path of positions
 
-SHARED_PART = 0.9  # correlation of the errors of turn and place along each axis
+SHARED_PART = 0.9  # correlation of the errors of orientation and position along each axis
 
 
 def coupled(truth: Motion6D, rng: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:

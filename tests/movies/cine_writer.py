@@ -101,7 +101,7 @@ def write_cine(path: Path, cine: Cine) -> Path:
 
 
 def image_bytes(cine: Cine, picture: NDArray[Any]) -> bytes:
-    """Return one image as it is stored: rows turned round by the rule, colours as B, G, R, bits packed."""
+    """Return one image as it is stored: rows reversed by the rule, colours as B, G, R, bits packed."""
     if cine.flip_h:
         picture = picture[:, ::-1]
     bottom_up = (cine.flip_v == 0) != bool(cine.packed_bits)

@@ -113,7 +113,7 @@ def test_starts_that_are_nan_are_not_used():
 
 
 def test_an_undetermined_direction_stays_and_has_no_gradient(points):
-    # One point: a turn about it, and turns against moves, leave the residual as it is.
+    # One point: a rotation about it, and rotations against moves, leave the residual as it is.
     seen = (points[:, :1] + 0.1).requires_grad_()
     got = fitted_points(torch.zeros_like(points[:, :1]), seen)
     assert_close(got.position_lab_mm, seen.detach()[:, 0], 1e-9)

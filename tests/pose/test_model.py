@@ -279,7 +279,7 @@ def changes_by_its_derivatives(pixels: Pixels, X: Tensor, R: Tensor, paint: Text
         assert float(((both[0] - both[1]) @ by_pose[i]) / (by_pose[i] @ by_pose[i])) == pytest.approx(size, rel=0.06)
 
 
-MOVED = f64([[0.04, -0.06, 0.08, 2.0 * PITCH_MM, 0.0, -1.5 * PITCH_MM]])  # turn, rad, and move, mm
+MOVED = f64([[0.04, -0.06, 0.08, 2.0 * PITCH_MM, 0.0, -1.5 * PITCH_MM]])  # rotation, rad, and move, mm
 
 
 def exposed(view: SphereView) -> Tensor:

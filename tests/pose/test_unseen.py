@@ -73,7 +73,7 @@ def share_known() -> torch.Tensor:
 
 @pytest.mark.slow
 def test_a_wrong_pose_does_not_hide_behind_unknown_paint(pixels, known):
-    """A pose that turns unknown paint to the cameras is less likely than one that explains the pictures."""
+    """A pose with unknown paint towards the cameras is less likely than one that explains the pictures."""
     for sign in (1, -1):  # body z along lab -y, to the first camera, and away from it
         north = R[:1].new_tensor([[1.0, 0, 0], [0, 0, -sign], [0, sign, 0]])
         wrong = fit(pixels, 0.5, known=True, start=north.expand(len(R), 3, 3))

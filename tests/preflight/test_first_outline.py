@@ -21,7 +21,7 @@ NEAR = pytest.approx(CIRCLE, abs=1.2)
 
 
 def film(path: Path, hidden: float, rim: float = 1.25, animal: bool = False, wall: bool = False) -> Path:
-    """A ball that turns, in a holder that hides this share of its height and has a bright rim of a larger radius;
+    """A rotating ball, in a holder that hides this share of its height and has a bright rim of a larger radius;
     `animal`: it moves on the ball; `wall`: something beside it flickers.
     """
     random, (u, v, radius) = np.random.default_rng(1), CIRCLE
@@ -72,7 +72,7 @@ def test_an_outline_is_right_or_doubtful_or_none(tmp_path, hidden, rim):
     look = seen(film(tmp_path / "ball.npy", hidden, rim, animal=True, wall=True))
     right = look.outline is not None and look.outline.circle == NEAR
     assert right or look.doubtful or look.outline is None, look.words()
-    assert look.outline is None or look.stays, "it turns in its place"
+    assert look.outline is None or look.stays, "a ball that stays"
 
 
 def test_text_figure_and_files_name_one_outline(tmp_path):

@@ -54,7 +54,7 @@ def test_a_ball_at_rest_does_not_give_the_step(clean, tmp_path):
 
 
 def turned(folder: Path, name: str, deg: float) -> None:
-    """Turn a camera about its vertical axis, as a knock does."""
+    """Rotate a camera about its vertical axis, as a knock does."""
     document = yaml.safe_load((folder / "cameras.yaml").read_text())
     camera = document["cameras"][name]
     c, s = np.cos(np.deg2rad(deg)), np.sin(np.deg2rad(deg))

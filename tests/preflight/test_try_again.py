@@ -23,7 +23,7 @@ CORNER = {"kind": "hide", "points": [[0, 0], [20, 0], [0, 20]]}
 
 @pytest.fixture(scope="module")
 def turning(tmp_path_factory) -> Path:
-    """A ball that turns in its place, of one camera, with comments in its files."""
+    """A fixed ball, of one camera, with comments in its files."""
     settings = SynthSettings(
         frames=60, image_size=(150, 150), diameter_px=56.0, volume_mm=8.0, velocity_rms=0.0, exposure=1e-4,
         exposure_samples=1, omega_rms=60.0, seed=5,

@@ -47,7 +47,7 @@ def interval(value: object, below: float = 0.1, above: float = 0.2) -> Interval:
 
 
 def planted_track(frames: int = 60, cameras: tuple[str, ...] = ("a", "b")) -> Trajectory:
-    """A sphere that moves along x, falls along z and turns about z by 20 degrees a frame."""
+    """A sphere that moves along x, falls along z and rotates about z by 20 degrees a frame."""
     time = np.arange(frames) / RATE_HZ
     position = np.stack([100 * time, np.zeros(frames), -50 * time**2], axis=1)
     R = Rotation.from_euler("z", 20.0 * np.arange(frames)[:, None], degrees=True).as_matrix()
@@ -382,7 +382,7 @@ def test_the_scale_of_angles_is_that_of_the_motion_and_the_whole_circle_where_th
 
 
 def test_bands_of_angles_agree_with_drawn_orientations():
-    """Oracle: errors of the orientation in lab components, drawn and turned into angles one by one."""
+    """Oracle: errors of the orientation in lab components, drawn and converted to angles one by one."""
     theta_deg, cov = np.array([40.0, 50.0, -70.0]), np.deg2rad(0.2) ** 2 * np.diag([1.0, 9.0, 4.0])
     cov[0, 2] = cov[2, 0] = np.deg2rad(0.2) ** 2 * 1.5
     R = Rotation.from_euler("XYZ", theta_deg, degrees=True)  # Rx Ry Rz

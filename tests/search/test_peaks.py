@@ -9,7 +9,7 @@ from sphereorient.search.grey_search import best_of_groups, compact_groups
 
 
 def turned_deg(*angles: float) -> torch.Tensor:
-    """Turns about one axis."""
+    """Rotations about one axis."""
     return so3.exp(torch.deg2rad(torch.tensor(angles))[:, None] * torch.tensor([0.6, 0.0, 0.8]))
 
 

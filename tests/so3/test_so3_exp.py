@@ -42,7 +42,7 @@ def test_exp_and_log_keep_all_digits_at_0_and_pi(rng, dtype, tolerance, turn):
     assert_close(torch.linalg.matrix_exp(so3.hat(back.double())), expected, atol=tolerance)
     if turn < 3:  # at pi either sign of the axis is right
         assert_close(back, rotvec, atol=tolerance)
-    if 0 < turn < 1:  # relative, not only absolute: a turn of 1e-9 is not lost
+    if 0 < turn < 1:  # relative, not only absolute: a rotation of 1e-9 is not lost
         assert ((back - rotvec).norm(dim=-1) / turn).max() < tolerance
 
 
@@ -82,7 +82,7 @@ def test_gradients_of_exp_and_log_agree_with_differences(rng):
     rotvec = torch.randn(4, 3, generator=rng, dtype=F64).requires_grad_()
     assert torch.autograd.gradcheck(so3.exp, rotvec)
     assert torch.autograd.gradcheck(so3.log, so3.exp(rotvec.detach()).requires_grad_())
-    # the last turns by 2.9 rad, where the quaternion's largest component is not w
+    # the last rotates by 2.9 rad, where the quaternion's largest component is not w
     far = (directions(rng, 5) * 2.9).requires_grad_()
     assert torch.autograd.gradcheck(lambda v: so3.log(so3.exp(v)), far)
 

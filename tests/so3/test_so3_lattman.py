@@ -29,7 +29,7 @@ def count(steps, delta):
 
 
 def turned(theta, d_lattman):
-    """Angle by which a small change of Lattman angles turns."""
+    """Angle of the rotation by a small change of Lattman angles."""
     moved = so3.from_lattman(so3.to_lattman(theta) + d_lattman)
     return so3.geodesic_distance(so3.from_tait_bryan(theta), so3.from_tait_bryan(moved))
 

@@ -87,7 +87,7 @@ def test_paint_and_background_have_their_given_levels_and_area():
 
 
 def test_the_middle_of_the_disk_shows_what_faces_the_camera():  # convention
-    # One white spot about body +x, turned to the camera in its direct line of sight, not along its axis.
+    # One white spot about body +x, rotated to the camera in its direct line of sight, not along its axis.
     spot = (map_directions(256)[..., 0] > 0.97).double()
     camera, position = near_camera(), f64(POSITIONS)
     x_cam_mm = position @ camera.R_cam_lab.mT + camera.T_cam_lab_mm
@@ -233,7 +233,7 @@ def test_the_picture_is_the_synthetic_movies_one():
     full = torch.from_numpy(cover) > 0.99
     assert miss.square().mean().sqrt() < 4.0  # of 150 grey levels from black to white
     assert miss[full].mean().abs() < 0.5
-    # East for west, or a turn by the inverse, is another picture.
+    # East for west, or a rotation by the inverse, is another picture.
     for other in (
         expected_grey(rays, place, R.mT, ball),
         expected_grey(rays, place, R, replace(ball, texture=ball.texture.flip(1))),

@@ -202,7 +202,7 @@ def test_turning_the_body_about_the_line_of_sight_turns_the_picture(rng):
     view = orthographic_view(20, torch.float64)
     render = partial(view.render, random_map(rng))
     R_view_body = so3.random_rotations((), generator=rng)
-    # z points away from the camera, y down: a turn by +90 degrees takes right to down, clockwise for the view.
+    # z points away from the camera, y down: a rotation by +90 degrees takes right to down, clockwise for the view.
     turned = render(so3.exp(f64([0, 0, math.pi / 2])) @ R_view_body)
     assert_close(turned, render(R_view_body).rot90(-1), atol=1e-12)
 
@@ -226,7 +226,7 @@ def test_the_pictures_slope_is_the_turning_of_the_map(rng):
     delta = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     middle = render(so3.exp(delta) @ R_view_body)[5, 5]
     (gradient,) = torch.autograd.grad(middle, delta)
-    # A turn about x right takes y down to z away: what faces the camera (-z) moves down (+y), what lay north comes in.
+    # A rotation about x takes y down to z away: paint facing the camera (-z) moves down (+y), northern paint comes in.
     assert_close(gradient, f64([1, 0, 0]), atol=1e-6)
 
 

@@ -25,12 +25,12 @@ LAB = Rotation.from_euler("xyz", [0.5, -1.0, 0.3]).as_matrix()
 
 
 def turned(turns: np.ndarray) -> np.ndarray:
-    """Orientations (N, 3, 3) after turns (N, 3), lab."""
+    """Orientations (N, 3, 3) after rotations (N, 3), lab."""
     return np.stack(list(accumulate(Rotation.from_rotvec(turns).as_matrix(), lambda R, T: T @ R)))
 
 
 def turns_of(frames: int, seed: int = 0) -> np.ndarray:
-    """Turns of a ball on which an animal walks ahead and turns, correlated over 15 frames."""
+    """Rotations of a ball on which an animal walks ahead and turns, correlated over 15 frames."""
     noise = np.random.default_rng(seed).normal(size=(frames + 100, 3))
     slow = lfilter([np.sqrt(1 - 0.935**2)], [1, -0.935], noise, axis=0)[100:]
     return 0.04 * slow + np.array([0.0, 0.05, 0.0])

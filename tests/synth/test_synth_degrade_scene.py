@@ -234,7 +234,7 @@ def test_spin_is_the_rms_turn_from_frame_to_frame_and_smears_no_more(degrees):
     time_s = torch.arange(3000, dtype=torch.float64) / settings.frame_rate
     R = motion_of(settings).at(time_s).R_lab_body
     turn = torch.rad2deg(so3.log(R[1:] @ R[:-1].mT).norm(dim=-1))
-    # Between frames omega turns too, and the chord is shorter: a few per cent at 60 degrees.
+    # Between frames omega changes too, and the chord is shorter: a few per cent at 60 degrees.
     assert float(turn.square().mean().sqrt()) == pytest.approx(degrees, rel=0.04)
     assert settings.exposure * settings.omega_rms == pytest.approx(SETTINGS.exposure * SETTINGS.omega_rms)
 

@@ -32,7 +32,7 @@ def attitudes() -> torch.Tensor:
 
 
 def face() -> torch.Tensor:
-    """R_view_body that turns body +x, the middle of the map, to the camera, north up."""
+    """R_view_body that rotates body +x, the middle of the map, to the camera, north up."""
     return torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]], dtype=torch.float64)
 
 
@@ -49,7 +49,7 @@ def test_a_white_ball_has_the_information_of_its_outline():  # oracle
 
 def test_one_straight_border_across_the_disk_has_the_information_worked_out_by_hand():  # oracle
     # East white, west black: the disk shows one line through the middle, tilted by half a radian to keep it off the
-    # rows of pixels. Turned by d about the view's z, its point at distance s from the middle moves by s d, and the
+    # rows of pixels. Rotated by d about the view's z, its point at distance s from the middle moves by s d, and the
     # squares add up to 2 r^3 / 3; about the line itself by sqrt(r^2 - s^2) d: 4 r^3 / 3.
     radius = 30.0
     east = (map_directions(512)[..., 1] > 0).float()
