@@ -1,4 +1,4 @@
-"""What all tests share: seeded tensors, tolerances by dtype, the places of the data."""
+"""Shared by all tests: seeded tensors, tolerances by dtype, folders of the data."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     # Two workers with two threads each wait for each other's cores; the commands that tests start inherit this.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-# No test may read what another run kept, or fill the folder of the user.
+# No test may read files that another run kept, or fill the folder of the user.
 os.environ["SPHEREORIENT_NO_CACHE"] = "1"
 
 import pytest

@@ -1,4 +1,4 @@
-"""The docs say what is: examples run, tables are those of the code, tests named in them exist."""
+"""The docs are right: examples run, tables are those of the code, tests named in them exist."""
 
 import contextlib
 import doctest
@@ -224,12 +224,12 @@ def test_the_files_of_the_walkthrough_load(tmp_path):
 
 
 def cells(line: str) -> str:
-    """The words of a printed line, without the borders of tables and however it is spaced."""
+    """The words of a printed line, without borders of tables and spaces."""
     return " ".join(re.sub("[│┃|]", " ", line).split())
 
 
 @pytest.mark.slow  # renders 60 frames and tracks them twice: a minute
-def test_the_commands_and_the_python_of_the_walkthrough_print_what_it_says(tmp_path, monkeypatch):
+def test_the_commands_and_the_python_of_the_walkthrough_print_its_output(tmp_path, monkeypatch):
     # A copy of the project's folder, so that its own out/ stays as it is.
     (tmp_path / ".venv").symlink_to(sys.prefix)
     (tmp_path / "out").mkdir()
@@ -272,7 +272,7 @@ def test_every_command_of_a_page_exists_with_its_options_and_settings(page):
 
 @pytest.mark.parametrize("page", DOCS, ids=lambda path: path.name)
 def test_every_file_of_the_project_that_a_page_names_exists(page):
-    if page.name == "CHANGELOG.md":  # names what was
+    if page.name == "CHANGELOG.md":  # names the past
         return
     rooms = "|".join(path.parent.name for path in (REPO / "sphereorient").glob("*/__init__.py"))
     text = page.read_text()
@@ -305,7 +305,7 @@ def test_no_sentence_of_the_docs_stands_twice_and_words_do_not_grow(capsys):
     assert docs_words.main() == 0, capsys.readouterr().out
 
 
-def test_a_sentence_that_stands_twice_is_found_whatever_its_marks():
+def test_a_sentence_that_stands_twice_is_found_with_any_marks():
     once = "The ball is found by its outline in each picture."
     first = f"# Title\n\n{once}\n\n```\n{once}\n```\n\n| {once} |\n"
     second = "- The **ball** is found\n  by [its outline](a.md) in each picture. A short one."

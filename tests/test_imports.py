@@ -41,19 +41,19 @@ def test_tests_and_scripts_import_public_names():
 
 
 @pytest.mark.parametrize("code", ["import sphereorient", "import sphereorient.cli", "import sphereorient.trajectory"])
-def test_the_front_door_does_not_wait_for_torch(code):
+def test_the_package_is_imported_without_torch(code):
     heavy = "{'torch', 'kornia', 'pytorch_lightning', 'scipy.optimize', 'matplotlib', 'pandas'}"
     check = f"{code}; import sys; late = {heavy} & set(sys.modules); assert not late, late"
     subprocess.run([sys.executable, "-c", check], check=True)
 
 
-def test_tracking_does_not_wait_for_what_it_does_not_use():
+def test_tracking_imports_no_unused_packages():
     unused = "{'kornia', 'pytorch_lightning', 'matplotlib', 'pandas'}"
     code = f"import sphereorient.methods.precise, sys; late = {unused} & set(sys.modules); assert not late, late"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_help_comes_without_torch():
+def test_help_imports_no_torch():
     code = "import sys; sys.argv = ['sphereorient', '--help']\nfrom sphereorient import cli\ntry:\n    cli.main()\n"
     code += "except SystemExit as stop:\n    assert not stop.code\nassert 'torch' not in sys.modules"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

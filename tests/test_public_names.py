@@ -1,4 +1,4 @@
-"""What `import sphereorient` offers: every name is there, completes, and is what its page says; one name, one thing."""
+"""Names of `import sphereorient`: each exists, completes, and is that of its page; one name, one meaning."""
 
 import ast
 import inspect

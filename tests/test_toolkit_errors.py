@@ -1,4 +1,4 @@
-"""Mistakes at the toolkit's edge: each is refused in one line that says what was expected, what came and what to do."""
+"""Mistakes at the toolkit's edge: each is refused in one line: expected, got, do."""
 
 import math
 
@@ -98,7 +98,7 @@ def test_a_bank_takes_both_types_and_arrays(form):
     assert torch.equal(ours.nan_to_num(), expected.nan_to_num())
 
 
-def test_what_is_unknown_stays_unknown_and_rounding_is_no_mistake():
+def test_unknown_values_stay_unknown_and_rounding_errors_are_accepted():
     so3.check_rotations("R", torch.stack([R, R * math.nan]))
     so3.check_rotations("R", R.half().float())
     so3.check_rotations("R", torch.zeros(0, 3, 3))

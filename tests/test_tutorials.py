@@ -1,4 +1,4 @@
-"""Each tutorial runs from its first line to its last; what it states is asserted in it."""
+"""Each tutorial runs from its first line to its last and asserts its own statements."""
 
 import os
 import re
@@ -15,7 +15,7 @@ TUTORIALS = sorted((REPO / "docs" / "tutorials").glob("*.py"))
 @pytest.mark.slow  # two of them learn a map
 @pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
 def test_a_tutorial_runs(path: Path, tmp_path: Path):
-    told = subprocess.run(
+    result = subprocess.run(
         [sys.executable, str(path)],
         cwd=tmp_path,
         capture_output=True,
@@ -23,7 +23,7 @@ def test_a_tutorial_runs(path: Path, tmp_path: Path):
         timeout=900,
         env=os.environ | {"MPLBACKEND": "agg"},
     )
-    assert told.returncode == 0, told.stderr
+    assert result.returncode == 0, result.stderr
     assert not list(tmp_path.iterdir())  # it leaves nothing behind
 
 

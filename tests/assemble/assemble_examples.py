@@ -21,7 +21,7 @@ def times(frames: int) -> Tensor:
 
 
 def turning(frames: int, deg_per_frame: float = 1.2) -> Tensor:
-    """A smooth turn whose axis slowly changes, (N, 3, 3)."""
+    """A smooth rotation whose axis slowly changes, (N, 3, 3)."""
     k = torch.arange(frames, dtype=torch.float64)
     axis = torch.stack([torch.cos(k / 40), torch.sin(k / 40), 0.5 * torch.ones_like(k)], dim=-1)
     steps = so3.exp(math.radians(deg_per_frame) * axis / axis.norm(dim=-1, keepdim=True))
@@ -32,7 +32,7 @@ def turning(frames: int, deg_per_frame: float = 1.2) -> Tensor:
 
 
 def turned_deg(R: Tensor, *degrees: float) -> Tensor:
-    """R turned on by a rotation vector in lab components."""
+    """R rotated further by a rotation vector in lab components."""
     return so3.exp(torch.deg2rad(torch.tensor(degrees, dtype=R.dtype))) @ R
 
 

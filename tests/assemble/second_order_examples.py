@@ -44,7 +44,7 @@ def physical_path(hypotheses: Hypotheses, time_s: Tensor, settings: PathSettings
 
 
 def pooled(*tracks: Tensor, nll: Sequence[float] | Tensor | None = None, mask: Tensor | None = None) -> Hypotheses:
-    """Tracks (N, 3, 3) side by side; of equal likelihood where nothing else is said."""
+    """Tracks (N, 3, 3) side by side; of equal likelihood by default."""
     R = torch.stack(tracks, 1)
     shape = R.shape[:2]
     given = torch.zeros(shape[1], dtype=torch.float64) if nll is None else torch.as_tensor(nll, dtype=torch.float64)

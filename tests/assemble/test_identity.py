@@ -1,4 +1,4 @@
-"""Balls that look alike keep their names by their motion; where that cannot be known, it is said."""
+"""Balls that look alike keep their names by their motion; frames where names are uncertain are marked."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ def test_a_ball_that_was_hidden_for_some_frames_is_the_one_that_is_missing():
     assert np.isnan(sure[:, :42]).all()
 
 
-def test_balls_that_meet_while_nobody_sees_them_are_said_to_be_in_doubt():
+def test_balls_that_meet_while_no_camera_sees_them_are_marked_as_doubtful():
     X, R = motions(1)
     apart = np.where(TIME_S < 0.1, 20 * (0.1 - TIME_S), 20 * (TIME_S - 0.1))[:, None] * np.array([1.0, 0, 0])
     X = np.concatenate([X - apart, X + apart])
-    R = np.concatenate([R, R])  # nor do their rotations tell
+    R = np.concatenate([R, R])  # nor do their rotations differ
     seen = np.ones((2, FRAMES), bool)
     seen[:, 40:80] = False
     _, sure = same_balls(X, R, seen, TIME_S, [])

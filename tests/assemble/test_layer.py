@@ -1,4 +1,4 @@
-"""The path as a layer: its costs against a slow loop, the place for none, gradients, learning, and use in `track`."""
+"""The path as a layer: its costs against a slow loop, the state for none, gradients, learning, and use in `track`."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def test_the_true_candidate_is_found_among_false_ones_that_stand_and_that_are_an
     assert (marginals[:, 0] > 0.97).all()
 
 
-def test_frames_in_which_no_candidate_is_right_say_none_and_empty_frames_nothing(rng):
+def test_frames_in_which_no_candidate_is_right_get_none_and_empty_frames_nothing(rng):
     R = turning(60, 4.0)
     R[20] = so3.random_rotations((), generator=rng)
     every = movie(R)
@@ -187,10 +187,10 @@ def test_frames_in_which_no_candidate_is_right_say_none_and_empty_frames_nothing
     marginals = soft(every).marginals
     assert marginals[20, 1] > 0.9
     assert not marginals[40:43].any()
-    assert marginals[43, 0] > 0.9  # the motion goes on behind the hole
+    assert marginals[43, 0] > 0.9  # the motion goes on after the gap
 
 
-def test_what_the_pictures_say_decides_between_twins(rng):
+def test_the_pictures_likelihood_decides_between_twins(rng):
     R = turning(30, 4.0)
     nll = torch.stack([torch.full((30,), 0.5), torch.zeros(30)], 1).double()
     half = so3.exp(torch.tensor([0.0, 0.0, torch.pi], dtype=torch.float64))
@@ -316,7 +316,7 @@ def test_sigmas_that_were_claimed_too_small_are_learnt(rng):
 
 
 def test_learnt_settings_are_read_by_track_and_change_its_path(rng, tmp_path):
-    # The pictures claim four times the nats there are, so that a false candidate wins where it should not.
+    # The likelihoods are four times too large in nats, so that a false candidate wins where it should not.
     R = turning(40, 4.0)
     nll = torch.zeros(40, 2, dtype=torch.float64)
     nll[10:30, 0] = 4 * 2.0

@@ -1,4 +1,4 @@
-"""One camera's path: planted truths are recovered, holes skipped, poor candidates kept out; docs/errata.md A6."""
+"""One camera's path: planted truths are recovered, gaps skipped, poor candidates left out; docs/errata.md A6."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_frames_without_candidates_are_skipped_and_the_link_over_them_takes_its_
 
 @pytest.mark.parametrize("by", ["hole", "uneven_times"])
 def test_the_longer_of_two_links_is_given_the_larger_turn(by):
-    """Both ways turn by 30 degrees in all; the better scored one turns by most of it in the short link."""
+    """Both ways rotate by 30 degrees in all; the better scored one by most of it in the short link."""
     still = torch.eye(3, dtype=torch.float64)
     early, late = turned_deg(still, 25.0, 0.0, 0.0), turned_deg(still, 5.0, 0.0, 0.0)
     frames = [[(still, 0.9)], [(early, 0.905), (late, 0.9)], [(turned_deg(still, 30.0, 0.0, 0.0), 0.9)]]

@@ -34,7 +34,7 @@ from sphereorient.trajectory import Flag
 SETTINGS = PathSettings()
 
 
-def test_errata_a6_a_false_candidate_that_stands_still_deceives_the_paper_and_not_this_path(rng):
+def test_errata_a6_a_false_candidate_that_stands_still_is_taken_by_the_paper_and_not_by_this_path(rng):
     R = turning(40)
     still = turned_deg(R[0], 0.0, 0.0, 120.0)
     paper = assemble_path(
@@ -70,7 +70,7 @@ def test_a_stuck_candidate_that_is_the_only_one_for_a_while_is_skipped_and_not_f
     shown[60 : 60 + length] = seen(standing(length), rng)
     path = physical_path(pooled(shown), times(120), SETTINGS)
     assert lost_frames(path) == list(range(60, 60 + length))
-    assert path.segment.tolist() == [0] * 120  # the motion goes on behind it
+    assert path.segment.tolist() == [0] * 120  # the motion goes on after it
     assert flagged(path, Flag.RECOVERED) == [60 + length]
     assert not flagged(path, Flag.SPIKE)
 
@@ -93,7 +93,7 @@ def test_thirty_per_cent_of_the_frames_may_be_missing(deg_per_frame, rng):
     assert lost_frames(path) == missing
     assert wrong_frames(path, R) == []
     assert set(path.segment.tolist()) <= {-1, 0}
-    rows = torch.nonzero(path.present).flatten()  # frames that were never written: the same, told by the times alone
+    rows = torch.nonzero(path.present).flatten()  # frames that were never written: the same, by the times alone
     dropped = physical_path(pooled(path.R_lab_body[rows]), times(300)[rows], SETTINGS)
     assert_close(dropped.turn_rad, path.turn_rad[rows])
     assert dropped.segment.unique().tolist() == [0]
@@ -121,11 +121,11 @@ def test_a_hole_of_twelve_frames_is_one_motion(rng):
 
 def test_false_candidates_beside_the_truth_behind_a_hole_are_not_taken(rng):
     R = turning(100, 3.7)
-    near = turned_deg(R, 25.0, 0.0, 0.0)  # from the truth, less than the turn over the hole
+    near = turned_deg(R, 25.0, 0.0, 0.0)  # from the truth, less than the rotation over the gap
     mask = torch.ones(100, 2, dtype=torch.bool)
     mask[50:62] = False
     path = physical_path(pooled(seen(near, rng), seen(R, rng), mask=mask, nll=[0.0, 0.0]), times(100), SETTINGS)
-    assert len(path.choice[path.present].unique()) == 1  # whichever: it is the same one before and behind
+    assert len(path.choice[path.present].unique()) == 1  # either one, but the same before and after
 
 
 def test_both_cameras_blind_for_twenty_frames_end_a_segment_and_the_next_begins_at_once(rng):
@@ -172,14 +172,14 @@ def test_a_turn_far_off_the_motion_parts_segments_although_no_break_is_thought_p
     assert physical_path(pooled(seen(R, rng)), times(100), small).segment.tolist() == [0] * 100
 
 
-def test_a_turn_of_more_than_half_a_circle_over_a_hole_is_counted_by_what_omega_says(rng):
+def test_a_rotation_by_more_than_half_a_turn_over_a_gap_is_counted_by_omega(rng):
     R = turning(100, 45.0)
     path = physical_path(without(seen(R, rng), range(50, 55)), times(100), SETTINGS)
     assert path.segment.tolist() == [0] * 100
     assert math.degrees(float(path.turn_rad[55].norm())) == pytest.approx(6 * 45.0, abs=2.0)
     assert_close(so3.exp(path.turn_rad[55]) @ path.R_lab_body[49], path.R_lab_body[55], 1e-9)
     shortest = so3.log(path.R_lab_body[55] @ path.R_lab_body[49].mT).norm()
-    assert math.degrees(float(shortest)) < 100  # the reading that takes the shortest turn
+    assert math.degrees(float(shortest)) < 100  # the reading that takes the shortest rotation
 
 
 def test_a_whole_turn_over_a_hole_is_not_taken_for_none(rng):
@@ -196,7 +196,7 @@ def test_turns_are_those_from_the_orientation_before():
     assert torch.isnan(path.turn_rad[[0, 4]]).all()
     assert_close(so3.exp(path.turn_rad[1]), R[1] @ R[0].mT)
     assert_close(so3.exp(path.turn_rad[5]), R[5] @ R[3].mT)
-    assert not torch.allclose(so3.exp(path.turn_rad[5]), R[3].mT @ R[5], atol=1e-4)  # the same turn in body axes
+    assert not torch.allclose(so3.exp(path.turn_rad[5]), R[3].mT @ R[5], atol=1e-4)  # the same rotation in body axes
 
 
 @pytest.mark.parametrize("deg_per_frame", [3.7, slow(22.0)])
@@ -209,9 +209,9 @@ def test_twins_that_turn_alike_are_flagged_with_even_odds(deg_per_frame, rng):
     assert len(path.choice.unique()) == 1
     assert flagged(path, Flag.AMBIGUOUS) == list(range(150))
     assert_close(path.posterior, torch.full_like(path.posterior, 0.5), 0.2)
-    told = torch.zeros(150, 2, dtype=torch.float64)
-    told[:, 0] = 0.2  # a little in every frame: over the movie it decides
-    assert physical_path(pooled(R, twin, nll=told), times(150), SETTINGS).choice.unique().tolist() == [1]
+    costs = torch.zeros(150, 2, dtype=torch.float64)
+    costs[:, 0] = 0.2  # a little in every frame: over the movie it decides
+    assert physical_path(pooled(R, twin, nll=costs), times(150), SETTINGS).choice.unique().tolist() == [1]
 
 
 def test_pictures_decide_where_motion_cannot():
@@ -222,7 +222,7 @@ def test_pictures_decide_where_motion_cannot():
     assert flagged(path, Flag.AMBIGUOUS) == [0]
 
 
-def test_a_frame_in_which_the_pictures_are_sure_and_wrong_is_mended_by_the_motion(rng):
+def test_a_frame_with_a_certain_but_wrong_likelihood_is_corrected_by_the_motion(rng):
     R = turning(80, 3.7)
     nll = torch.tensor([0.0, 30.0], dtype=torch.float64).repeat(80, 1)
     nll[40] = torch.tensor([30.0, 0.0])
@@ -241,7 +241,7 @@ def test_single_candidates_are_left_as_they_are(deg_per_frame, rng):
 
 
 def crowded(rng: torch.Generator, frames: int = 60) -> tuple[Hypotheses, torch.Tensor]:
-    """The truth in a random place among false ones, here and there absent; scores that help a little."""
+    """The truth in a random place among false ones, missing in some frames; scores help a little."""
     R = turning(frames, 6.0)
     every = so3.random_rotations((frames, 4), generator=rng)
     mask = torch.rand(frames, 4, generator=rng) < 0.8
@@ -291,7 +291,7 @@ def test_places_that_are_not_in_use_may_hold_anything(rng):
 
 
 def test_uneven_times_are_no_change_of_omega(rng):
-    """A steady turn, sampled with steps of one to three intervals."""
+    """A steady rotation, sampled with steps of one to three intervals."""
     time = torch.randint(1, 4, (120,), generator=rng).cumsum(0) / RATE_HZ
     rate = torch.tensor([0.3, -0.2, 1.0], dtype=torch.float64) * 40
     R = so3.exp(time.double()[:, None] * rate)

@@ -21,7 +21,7 @@ from sphereorient.assemble import PathSettings, beam
 
 @dataclass
 class Enumeration:
-    """All histories of a movie by recursion, as slow as it is plain; settings' and model's names as in the package."""
+    """All histories of a movie by plain, slow recursion; names of settings and model as in the package."""
 
     hypotheses: Hypotheses
     time: list[float]
@@ -66,7 +66,7 @@ class Enumeration:
         return self.picture(f, k) * ratio / false
 
     def onward(self, f: int, k: int, state: dict) -> list[tuple[float, np.ndarray]]:
-        """Ways to go on from a state to a candidate: ratio of density and turn; none where the motion is lost."""
+        """Links from a state to a candidate: ratio of density and rotation; none where the motion is lost."""
         g, j, dt = state["frame"], state["candidate"], self.time[f] - self.time[state["frame"]]
         if dt > (self.s.gap_frames_max + 1.5) * self.usual:
             return []
@@ -148,7 +148,7 @@ def test_short_movies_agree_with_the_sum_over_all_histories_one_by_one(seed, mon
     for (f, k), weight in oracle.sums.items():
         posterior[f, k] = weight / oracle.total
     assert_close(path.posterior, posterior, 1e-9)
-    assert float(posterior.max(1).values[path.present].min()) < 0.999  # a movie of which nothing was to be decided
+    assert float(posterior.max(1).values[path.present].min()) < 0.999  # a movie without a choice
     chosen = dict(oracle.best[1])
     assert path.choice.tolist() == [chosen.get(f, -1) for f in range(6)]
 
@@ -166,7 +166,7 @@ def test_probabilities_of_a_frame_and_of_none_make_one(rng):
 
 
 def world(seed: int, frames: int, sigma: float, change: float, seen_share: float) -> tuple[Hypotheses, torch.Tensor]:
-    """A movie drawn as the model says: omega wanders, pictures are as sure as they claim, the search fails in bursts.
+    """A movie drawn from the model: omega wanders, likelihoods are calibrated, the search fails in bursts.
 
     Returns:
         Hypotheses of three candidates a frame, and the place of the right one, -1 where there is none.
@@ -199,7 +199,7 @@ def world(seed: int, frames: int, sigma: float, change: float, seen_share: float
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma_deg", [0.1, 12.0])
-def test_frames_said_to_be_right_with_a_probability_are_so_at_least_that_often(sigma_deg):
+def test_frames_with_a_stated_probability_are_right_at_least_that_often(sigma_deg):
     probability, right = [], []
     for seed in range(3):
         settings = PathSettings(miss_probability=0.05)
@@ -216,4 +216,4 @@ def test_frames_said_to_be_right_with_a_probability_are_so_at_least_that_often(s
         error = float((p * (1 - p))[inside].sum().sqrt() / inside.sum())
         assert float(truth[inside].mean()) >= float(p[inside].mean()) - 3 * error - 1e-3, (low, high)
     if sigma_deg > 1:
-        assert ((p > 0.6) & (p < 0.9)).sum() >= 10  # motion and pictures leave something open
+        assert ((p > 0.6) & (p < 0.9)).sum() >= 10  # motion and pictures leave some doubt

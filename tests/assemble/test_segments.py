@@ -55,7 +55,7 @@ def seen_on_a_grid(seed: int, deg_per_frame: float, wrong: slice = slice(0, 0)):
     return single(R, dict(enumerate(score)))
 
 
-# Fast: every turn is above the least one, so only the size of xi tells noise from a spike.
+# Fast: every rotation is above the least one, so only the size of xi distinguishes noise from a spike.
 @pytest.mark.parametrize("deg_per_frame", [2.0, 18.0], ids=["usual", "fast"])
 @pytest.mark.parametrize("seed", [0, 1, slow(2), slow(3)])
 def test_ordinary_motion_seen_on_a_grid_has_no_spike(seed, deg_per_frame):

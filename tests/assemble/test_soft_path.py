@@ -1,4 +1,4 @@
-"""The soft path of both orders: against all paths, its derivatives, its limits, and where nothing goes."""
+"""The soft path of both orders: against all paths, its derivatives, its limits, and movies without a path."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def test_where_no_path_is_left_there_is_no_probability_no_choice_and_no_gradient
 
 
 @pytest.mark.parametrize(("order", "poison"), [(1, torch.nan), *itertools.product((1, 2), (torch.inf, -1e5))], ids=str)
-def test_what_stands_at_masked_candidates_does_not_matter(poison, order):
+def test_values_at_masked_candidates_do_not_matter(poison, order):
     costs = random_costs((30,), 4, 1, order=order)
 
     def spoilt(part: Tensor) -> Tensor:

@@ -61,9 +61,7 @@ def test_cost_agrees_with_dijkstra_where_frames_are_empty_and_candidates_masked(
 @ORDERS
 @TIES
 @pytest.mark.parametrize("seed", SEEDS)
-def test_of_all_paths_the_cheapest_is_taken_and_of_equal_ones_that_of_the_lowest_indices_from_the_end(
-    seed, ties, order
-):
+def test_the_cheapest_path_is_taken_and_among_equal_ones_that_of_the_lowest_indices_from_the_end(seed, ties, order):
     costs = random_costs((7,), 3, seed, order=order, walls=0.15 * (seed % 2))
     costs = costs.each(torch.round) if ties else costs
     path, (steps, every) = cheapest(costs), all_paths(costs)
@@ -134,7 +132,7 @@ def test_single_precision_takes_the_same_path(order, seed):
 
 
 @pytest.mark.parametrize("poison", [torch.inf, torch.nan, -100.0], ids=str)
-def test_what_stands_on_edges_of_masked_candidates_does_not_matter(poison):
+def test_edges_of_masked_candidates_do_not_matter(poison):
     costs = random_costs((30,), 4, 1, order=1)
     edges, mask = costs.pair, costs.mask
     clean = shortest_path(edges, mask)
@@ -149,7 +147,7 @@ def test_what_stands_on_edges_of_masked_candidates_does_not_matter(poison):
 
 
 @pytest.mark.parametrize("poison", [torch.inf, torch.nan, -100.0], ids=str)
-def test_what_stands_on_triples_of_masked_candidates_does_not_matter(poison, rng):
+def test_triples_of_masked_candidates_do_not_matter(poison, rng):
     cost = torch.rand(8, 3, 3, 3, dtype=torch.float64, generator=rng)
     mask = torch.arange(3) != torch.randint(0, 3, (10, 1), generator=rng)
     usable = mask[:-2, :, None, None] & mask[1:-1, None, :, None] & mask[2:, None, None, :]
@@ -189,7 +187,7 @@ def test_a_path_without_edges_and_triples_is_refused():
 
 
 @ORDERS
-def test_gradient_of_the_least_cost_is_one_on_what_the_path_pays(order):
+def test_gradient_of_the_least_cost_is_one_on_the_costs_of_the_path(order):
     costs = random_costs((2, 6), 2, 5, order=order).each(Tensor.requires_grad_)
     path = cheapest(costs)
     path.cost.sum().backward()

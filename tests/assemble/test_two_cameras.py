@@ -37,7 +37,7 @@ def mended(track: Fused, name: str) -> list[int]:
 
 
 def false_track(R):
-    """A candidate that turns as the truth does, 110 degrees beside it."""
+    """A candidate that rotates as the truth does, 110 degrees beside it."""
     return turned_deg(R, 0.0, 0.0, 110.0)
 
 
@@ -59,7 +59,7 @@ def instead(R, *found, frames=STRETCH, score: float = 0.9):
 
 
 def contradiction(*seen, settings: AssembleSettings = SETTINGS, deceived=("cam1",)) -> Fused:
-    """Fuse cameras of which some follow their best candidate, which in the stretch is false."""
+    """Fuse cameras, some of which follow their best candidate, false in the stretch."""
     cameras = {f"cam{k + 1}": each for k, each in enumerate(seen)}
     time = times(len(seen[0]))
     paths = assemble_paths(cameras, time, settings)
@@ -85,7 +85,7 @@ def as_pair(wrong: str, deceived, right):
 
 
 @pytest.mark.parametrize(("false_score", "true_score"), [(0.9, 0.85), (0.99, 0.7)])
-def test_a_camera_deceived_for_a_stretch_is_repaired_from_the_other_whatever_the_scores(wrong, false_score, true_score):
+def test_a_camera_wrong_for_a_stretch_is_repaired_from_the_other_whatever_the_scores(wrong, false_score, true_score):
     R = turning(60)
     pair = as_pair(wrong, sees(R, false_in=STRETCH, false_score=false_score), sees(R, true_score=true_score))
     track = contradiction(*pair, deceived=[wrong])
@@ -132,7 +132,7 @@ def test_where_the_loser_has_no_candidate_the_winner_stands_alone(wrong):
 
 def test_where_neither_has_a_candidate_near_the_other_the_steadier_one_stands_alone_and_the_guess_is_marked(wrong):
     R = turning(60)
-    deceived = sees(R, false_in=STRETCH, true_in=(), false_score=0.98)  # its T does not help it
+    deceived = sees(R, false_in=STRETCH, true_in=(), false_score=0.98)  # in spite of its T
     track = contradiction(*as_pair(wrong, deceived, sees(R)), deceived=[wrong])
     assert_close(track.R_lab_body, R, 1e-9)
     assert has(track, Flag.AMBIGUOUS) == list(STRETCH)
@@ -141,7 +141,7 @@ def test_where_neither_has_a_candidate_near_the_other_the_steadier_one_stands_al
 
 
 def test_where_both_lack_the_truth_and_contradict_each_other_the_result_is_wrong_but_marked(wrong):
-    """Nothing can be right there: the steadier of two false tracks stands alone, as a guess and between spikes."""
+    """No candidate is right there: the steadier of two false tracks is taken alone, as a guess between spikes."""
     R = turning(60)
     rough = turned_deg(R, 0.0, 108.0, 0.0)
     rough[21::2] = turned_deg(rough[21::2], 0.0, 12.0, 0.0)  # no spike, but the rotation back is larger
@@ -156,8 +156,8 @@ def test_where_both_lack_the_truth_and_contradict_each_other_the_result_is_wrong
     assert track.R_lab_body_of[wrong][list(STRETCH)].isnan().all()
 
 
-def test_where_both_are_wrong_alike_only_the_spikes_tell():
-    """A known weakness: cameras that agree are believed."""
+def test_where_both_cameras_are_wrong_alike_only_spikes_show_it():
+    """A known weakness: a false orientation that both cameras share is accepted."""
     R = turning(60)
     false = sees(R, false_in=STRETCH, true_in=())
     track = fused({"cam1": false, "cam2": false})
@@ -187,7 +187,7 @@ def test_a_larger_margin_makes_more_of_the_repairs_a_guess():
 
 
 def test_a_camera_that_sees_something_else_in_each_frame_loses_all_of_them(rng, wrong):
-    """Pieces of one frame, without a candidate that both have: continuity with what was decided before must lead."""
+    """Pieces of one frame without a common candidate: continuity with the frames before must decide."""
     R = turning(60)
     deceived = instead(R, (so3.random_rotations(60, generator=rng), 0.9), frames=range(20, 34))
     track = contradiction(*as_pair(wrong, deceived, sees(R)), deceived=[wrong])
@@ -196,7 +196,7 @@ def test_a_camera_that_sees_something_else_in_each_frame_loses_all_of_them(rng, 
 
 
 def test_a_false_segment_is_corrected_as_a_whole_also_where_it_comes_near_the_truth(wrong):
-    """Between its two spikes the false path passes within 30 degrees of the truth; those frames are not believed."""
+    """Between its two spikes the false path passes within 30 degrees of the truth; those frames are not accepted."""
     R = turning(60)
     beside = torch.zeros(60, 3, dtype=torch.float64)
     beside[20:30, 0] = torch.arange(100, -100, -20).double().deg2rad()  # 20 a frame are no spike here
@@ -235,7 +235,7 @@ def test_planted_false_stretches_are_found_between_spikes_and_none_of_their_fram
     assert false == replaced + dropped == 185
     assert replaced >= 57  # every third frame has the true candidate
     assert left == 0
-    assert frames == 594  # six in which one camera is false and the other saw nothing
+    assert frames == 594  # six in which one camera is false and the other has no candidate
     assert rms_deg < 0.9  # of single cameras 1 degree
     if seed == 0:
         table = "".join(f"| {what} | {number} |\n" for what, number in numbers.items())
@@ -270,7 +270,7 @@ def test_continuity_counts_a_turn_over_a_hole_by_the_frame():
 
 def test_a_frame_that_one_camera_missed_does_not_split_a_stretch():
     R = turning(60)
-    # left of the hole alone the false candidate would win: there the other camera has it too, and scores it higher
+    # before the gap alone the false candidate would win: there the other camera has it too, with a higher score
     false = false_track(R)
     first = instead(R, (false, 0.9), (R, 0.8))
     second = candidates_of(
@@ -325,7 +325,7 @@ def test_sigma_is_the_error_per_axis_of_the_mean(rng, first, second, within):
     assert abs(float(true_error) / best_possible - 1) < 0.15
 
 
-def test_sigma_of_good_frames_does_not_notice_the_frames_that_stayed_wrong(rng):
+def test_sigma_of_good_frames_does_not_depend_on_the_frames_that_stayed_wrong(rng):
     R = turning(4000, 0.3)
     left, right = noisy(R, 0.02, rng), noisy(R, 0.02, rng)
     wrong = torch.arange(20, 4000, 100)
@@ -420,7 +420,7 @@ def test_paths_candidates_and_times_are_left_as_they_were():
     records = [*paths.values(), *cameras.values()]
     before = [{name: value.clone() for name, value in tensors(record).items()} for record in records]
     track = fuse(paths, cameras, time, SETTINGS)
-    assert has(track, Flag.REPAIRED_FROM_OTHER_CAMERA) == list(STRETCH)  # there was something to write
+    assert has(track, Flag.REPAIRED_FROM_OTHER_CAMERA) == list(STRETCH)  # the repair wrote something
     for record, old in zip(records, before, strict=True):
         for name, value in tensors(record).items():
             assert_close(value, old[name])
@@ -456,12 +456,12 @@ def test_candidates_of_another_camera_are_refused():
 
 
 def of_three(wrong: str, deceived) -> Fused:
-    """Fuse three cameras of which one follows its best candidate, which in the stretch is false."""
+    """Fuse three cameras, one of which follows its best candidate, false in the stretch."""
     return contradiction(*(deceived if name == wrong else sees(turning(60)) for name in THREE), deceived=[wrong])
 
 
 @pytest.mark.parametrize("wrong", THREE)
-def test_two_of_three_cameras_overrule_the_third_whatever_its_score(wrong):
+def test_two_of_three_cameras_overrule_the_third_at_any_score(wrong):
     whole = of_three(wrong, sees(turning(60), false_in=STRETCH, false_score=0.99, true_score=0.6))
     assert_close(whole.R_lab_body, turning(60), 1e-9)
     assert mended(whole, wrong) == list(STRETCH)

@@ -1,4 +1,4 @@
-"""Random small graphs, and all their paths one by one: what every recursion must agree with."""
+"""Random small graphs, and all their paths one by one, as the oracle of every recursion."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def batched(movies: Sequence[Costs]) -> Costs:
 
 
 def cost_of(costs: Costs, steps: list[int], places: tuple[int, ...]) -> float:
-    """Cost of one path: what enters a step comes from the steps visited last."""
+    """Cost of one path: edges into a step come from the steps visited last."""
     total = sum(float(costs.node[step, place]) for step, place in zip(steps, places, strict=True))
     for n in range(1, len(steps)):
         total += float(costs.pair[steps[n] - 1, places[n - 1], places[n]])

@@ -30,7 +30,7 @@ FRAMES = 12
 
 
 def write_truth(path: Path, names: str, apart_mm: float = 30.0) -> dict[str, dict[str, np.ndarray]]:
-    """Balls on a line along x, each turned otherwise."""
+    """Balls on a line along x, each with another rotation."""
     rng = np.random.default_rng(3)
     truth = {
         name: {
@@ -49,7 +49,7 @@ def write_truth(path: Path, names: str, apart_mm: float = 30.0) -> dict[str, dic
 
 
 def tracks_of(truth: dict[str, dict[str, np.ndarray]], named: dict[str, str]) -> Tracks:
-    """Tracks that say what is true of other balls: `named` holds the ball that is meant by a name."""
+    """Tracks with the true poses of other balls: `named` holds the ball behind each name."""
     time_s = next(iter(truth.values()))["time"]
     empty = Trajectory.empty(time_s, cameras=("cam1",), frame_rate=600.0, method="precise")
     empty = replace(empty, valid=np.ones(FRAMES, bool))
@@ -90,7 +90,7 @@ def test_a_track_of_one_ball_is_no_track_of_several(tmp_path):
         score_track(track, tmp_path / "truth.h5")
 
 
-def test_what_nearer_balls_hide_is_the_lens_that_two_circles_share():
+def test_the_part_that_nearer_balls_hide_is_the_lens_that_two_circles_share():
     """By hand: circles whose centres are a radius apart share 2/3 - sqrt(3) / (2 pi), 0.391, of each."""
     far, radius = 1e6, 9.0  # so far away that depth changes no size
     lens = PinholeCamera(
@@ -125,7 +125,7 @@ def test_a_scene_has_as_many_balls_cameras_and_paints_as_its_plan(tmp_path):
 
 
 def test_each_ball_of_a_scene_is_measured_and_alike_ones_by_the_names_of_the_truth(tmp_path):
-    """Balls a and c wear one paint and come exchanged; b, of another paint, is taken for a in three frames."""
+    """Balls a and c have the same paint and are exchanged; b, of another paint, is taken for a in three frames."""
     (scene,) = scenes_of(BenchSettings(degradations=(), seeds=(0,), balls=3, paints=2, frames=FRAMES))
     truth = write_truth(tmp_path / "truth.h5", "abc")
     write_experiment(tmp_path, scene)
@@ -213,10 +213,10 @@ def test_the_command_writes_table_and_figure_and_prints_a_row_for_each_point(tmp
         return curve()
 
     monkeypatch.setattr("sphereorient.bench.run_benchmarks", planned)
-    code, told, _ = command(monkeypatch, capsys, "bench", "balls", "--out", tmp_path / "run", "--balls", "1,4")
+    code, printed, _ = command(monkeypatch, capsys, "bench", "balls", "--out", tmp_path / "run", "--balls", "1,4")
     assert code == 0
-    assert "density.png" in told
-    assert len([line for line in told.splitlines() if "2.6" in line or "10.5" in line]) == 4
+    assert "density.png" in printed
+    assert len([line for line in printed.splitlines() if "2.6" in line or "10.5" in line]) == 4
     assert {name: (plan.balls, plan.cameras, plan.paints, plan.volume_mm) for name, plan in asked.items()} == {
         "1-balls-2-cameras": (1, 2, 2, 45.0),
         "4-balls-2-cameras": (4, 2, 2, 45.0),
@@ -236,7 +236,7 @@ def test_the_command_writes_table_and_figure_and_prints_a_row_for_each_point(tmp
     ],
 )
 def test_bad_numbers_are_one_line(tmp_path, monkeypatch, capsys, arguments, words):
-    code, _, said = command(monkeypatch, capsys, "bench", "balls", "--out", tmp_path / "run", *arguments)
-    assert code == 2, said
-    assert len(said.strip().splitlines()) == 1
-    assert words in said
+    code, _, errors = command(monkeypatch, capsys, "bench", "balls", "--out", tmp_path / "run", *arguments)
+    assert code == 2, errors
+    assert len(errors.strip().splitlines()) == 1
+    assert words in errors

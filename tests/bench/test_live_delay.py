@@ -61,7 +61,7 @@ def test_neighbours_keep_cores_busy_and_end():
 
 
 @pytest.mark.parametrize("rate", ["0", "x", ",", "nan", "100,-5"])
-def test_the_bench_wants_rates(rate, monkeypatch):
+def test_rates_that_are_none_are_refused(rate, monkeypatch):
     monkeypatch.setattr("sphereorient.bench.live.delays", lambda *_, **__: pytest.fail("too late"))
     run = CliRunner().invoke(app, ["bench", "live", str(EXCERPT / "experiment.yaml"), "--rate", rate])
     assert run.exit_code != 0

@@ -99,7 +99,7 @@ def results(*outcomes: SceneResult) -> Results:
     return Results(settings=BenchSettings(), versions={}, outcomes=outcomes)
 
 
-def test_what_was_planted_is_measured(truth):
+def test_planted_values_are_measured(truth):
     path, R = truth
     found = SceneResult(scene="s", kind="k", level=1, seed=0, degradations={}, method="m",
                     seconds=2.0, **measure(planted(R), path))  # fmt: skip
@@ -124,7 +124,7 @@ def test_the_row_of_a_table_is_that_of_its_frames(truth):
     assert line.wrong_after == pytest.approx(2 / 48)
     assert line.lost == pytest.approx(1 / 48)
     assert line.inside == pytest.approx(44 / 47)
-    assert line.over_stated == one.over_stated  # the other one states none: of an older version
+    assert line.over_stated == one.over_stated  # the other one, of an older version, has none
     assert line.wrong_before == pytest.approx((6 + 48) / (24 + 48))
     assert line.frames_per_s == pytest.approx(48 / 3)
 
@@ -186,7 +186,7 @@ def noisy(size: float, seed: int) -> tuple[float, ...]:
     return tuple((size * np.random.default_rng(seed).rayleigh(1.0, FRAMES)).tolist())
 
 
-def test_what_got_worse_is_named_and_scatter_is_not():
+def test_worse_results_are_named_and_scatter_is_not():
     before = results(outcome(orientation_deg=noisy(0.02, 1)), outcome(scene="spin-1-0-0", kind="spin"))
     same = results(outcome(orientation_deg=noisy(0.02, 2)), outcome(scene="spin-1-0-0", kind="spin"))
     assert not [change for change in compare_runs(same, before) if change.worse or change.better]
@@ -215,7 +215,7 @@ def never(experiment: Path) -> Trajectory:
     raise TrackError("movies: expected a ball, got none; look at them")
 
 
-def test_what_a_method_refuses_is_an_outcome(tmp_path):
+def test_a_refusal_by_a_method_is_an_outcome(tmp_path):
     (scene,) = scenes_of(BenchSettings(degradations=(), seeds=(0,), frames=12, together=0))
     (found,) = track_scene(write_scene(tmp_path, scene), scene, "never", never)
     assert found.refused.startswith("movies: expected a ball")
@@ -262,13 +262,13 @@ def test_the_papers_method_on_a_small_run(tmp_path):
     ],
 )
 def test_bad_input_is_one_line(tmp_path, monkeypatch, capsys, arguments, words):
-    code, _, said = command(monkeypatch, capsys, "bench", "robustness", "--out", tmp_path / "run", *arguments)
+    code, _, errors = command(monkeypatch, capsys, "bench", "robustness", "--out", tmp_path / "run", *arguments)
     assert code == 2
-    assert len(said.strip().splitlines()) == 1
-    assert words in said
+    assert len(errors.strip().splitlines()) == 1
+    assert words in errors
 
 
-def test_a_file_says_which_scenes_and_an_option_wins(tmp_path, monkeypatch, capsys):
+def test_a_file_names_the_scenes_and_an_option_wins(tmp_path, monkeypatch, capsys):
     config = tmp_path / "bench.yaml"
     config.write_text("degradations: [defocus]\nlevels: [2]\nseeds: [0]\ntogether: 0\nframes: 12\n")
     seen = []
@@ -283,17 +283,17 @@ def test_a_file_says_which_scenes_and_an_option_wins(tmp_path, monkeypatch, caps
     )
     assert [(scene.name, scene.plan.frames) for scene in seen] == [("clean-0-0-0", 15), ("defocus-4-0-0", 15)]
     config.write_text("level: [2]\n")
-    code, _, said = command(monkeypatch, capsys, "bench", "scenes", "--out", out, "--settings", config)
-    assert (code, len(said.strip().splitlines())) == (2, 1)
-    assert "write 'levels'" in said
+    code, _, errors = command(monkeypatch, capsys, "bench", "scenes", "--out", out, "--settings", config)
+    assert (code, len(errors.strip().splitlines())) == (2, 1)
+    assert "write 'levels'" in errors
 
 
 def test_compare_as_a_command(tmp_path, monkeypatch, capsys):
     save_results(results(outcome()), tmp_path / "old.json")
     save_results(results(outcome(orientation_deg=(0.2,) * FRAMES)), tmp_path / "new.json")
-    code, told, _ = command(monkeypatch, capsys, "bench", "compare", tmp_path / "new.json", tmp_path / "old.json")
+    code, printed, _ = command(monkeypatch, capsys, "bench", "compare", tmp_path / "new.json", tmp_path / "old.json")
     assert code == 1
-    assert "worse: defocus 1, precise: median error, degrees 0.02 -> 0.2" in told
+    assert "worse: defocus 1, precise: median error, degrees 0.02 -> 0.2" in printed
     assert command(monkeypatch, capsys, "bench", "compare", tmp_path / "old.json", tmp_path / "old.json")[0] == 0
 
 

@@ -29,7 +29,7 @@ def truth() -> dict[str, np.ndarray]:
 
 
 def perfect(truth: dict[str, np.ndarray], frames: slice = slice(None)) -> Trajectory:
-    """A track that says what is true."""
+    """A track with the true poses."""
     time = truth["time"][frames]
     track = Trajectory.empty(time, cameras=("cam1", "cam2"), frame_rate=600.0, method="paper", experiment="excerpt")
     known = {key: truth[key][frames] for key in ("position", "orientation", *RATES)}
@@ -106,7 +106,7 @@ def test_rates_count_only_where_they_were_measured(truth):
     assert score.relative_rms["omega_lab"] == pytest.approx(0.2, rel=1e-9)
 
 
-def test_what_was_never_measured_has_no_error(truth):
+def test_frames_without_a_measurement_have_no_error(truth):
     score = score_track(Trajectory.empty(truth["time"], cameras=("cam1",), frame_rate=600.0), TRUTH)
     assert not score.valid.any()
     assert np.isnan(score.percentiles_deg()).all()
@@ -137,7 +137,7 @@ def test_percentiles_are_the_median_two_tails_and_the_worst(truth):
     np.testing.assert_allclose(score.percentiles_mm(), [1.95, 3.705, 3.861, 3.9], rtol=1e-6)
 
 
-def test_a_frame_without_a_position_is_not_valid_whatever_the_track_says(truth):
+def test_a_frame_without_a_position_is_not_valid_whatever_the_tracks_flag(truth):
     track = perfect(truth)
     position = track.position.copy()
     position[3] = np.nan

@@ -20,7 +20,7 @@ from torch import Tensor
 from sphereorient.cameras import Camera, PinholeCamera
 
 F_PX, PITCH = 900.0, (0.02, 0.02)
-AT = torch.tensor([0.0, 0.0, 260.0], dtype=torch.float64)  # middle of what both see
+AT = torch.tensor([0.0, 0.0, 260.0], dtype=torch.float64)  # middle of the common view
 APART_DEG = 50.0  # between the cameras' axes
 # Tilt, direction of its axis, spin (degrees), and shift (mm) of each pose; none is seen from behind.
 POSES = [
@@ -36,7 +36,7 @@ ALONE = {(4, "cam2")}  # pictures that were not taken
 
 @dataclass(frozen=True, kw_only=True)
 class Posed(Scene):
-    """A plate in any place before the camera."""
+    """A plate at any position before the camera."""
 
     R: Tensor = field(default_factory=lambda: torch.eye(3).double())
     T: Tensor = field(default_factory=lambda: AT)
@@ -91,7 +91,7 @@ def pictures() -> Mapping[str, NDArray[np.uint8]]:
 
 
 def document() -> dict[str, Any]:
-    """What calibration.yaml says."""
+    """Content of calibration.yaml."""
     entries = []
     for row in range(len(POSES)):
         names = {name: f"{name}_{row:02}.png" for name in ("cam1", "cam2") if (row, name) not in ALONE}

@@ -1,4 +1,4 @@
-"""Two cameras at right angles, with and without walls, and what they would see of a plate held in many poses."""
+"""Two cameras at right angles, with and without walls, and their views of a plate held in many poses."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def cameras(model: str = "tsai", walls: bool = False, turned_deg: float = 0.5) -
 
 
 def poses(count: int, rng: torch.Generator, tilt_deg: float = 25.0, shift_mm: float = 15.0) -> tuple[Tensor, Tensor]:
-    """Plate poses: the first is surveyed, the others are tilted and shifted by chance."""
+    """Plate poses: the first is surveyed, the others are tilted and shifted at random."""
     turn = torch.deg2rad(tilt_deg * (2 * torch.rand(count, 3, generator=rng, dtype=torch.float64) - 1))
     move = shift_mm * (2 * torch.rand(count, 3, generator=rng, dtype=torch.float64) - 1)
     turn[0], move[0] = 0.0, 0.0
@@ -86,7 +86,7 @@ def planted(rng: torch.Generator, model: str = "tsai", walls: bool = False, coun
 
 
 def view(rig: Rig, name: str, row: int, rng: torch.Generator, noise_px: float = 0.03) -> PlateView:
-    """Return what one camera sees of one pose: centroids, with noise."""
+    """Return the view of one camera of one pose: centroids with noise."""
     index = PLATE.indices
     points, width = torch.from_numpy(PLATE.points(index)), torch.from_numpy(PLATE.diameters(index))
     camera, R, T = rig.cameras[name], rig.R_lab_plate[row], rig.T_lab_plate_mm[row]
@@ -110,7 +110,7 @@ def views(rig: Rig, rng: torch.Generator, noise_px: float = 0.03) -> Views:
 def document(
     rig: Rig, model: str = "tsai", ports: Mapping[str, Port] | None = None, pitch: tuple[float, float] = PITCH
 ) -> CalibrationDocument:
-    """What a calibration.yaml would say of the rig."""
+    """Content of a calibration.yaml of the rig."""
     return CalibrationDocument(
         path=Path("calibration.yaml"),
         keys=CalibrationKeys(image_size=SIZE, pixel_pitch=pitch, model=model),
@@ -137,7 +137,7 @@ def calibrated(rig: Rig, seen: Views, model: str = "tsai", ports: Mapping[str, P
 
 
 def triangulated_error_mm(found: Mapping[str, Camera], true: Mapping[str, Camera], half_mm: float = 30.0) -> float:
-    """Rms distance of points in a cube, seen by the true cameras, from where the found cameras put them."""
+    """Rms error of points in a cube, seen by the true cameras and triangulated by the found ones."""
     points = half_mm * (2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(1)).double() - 1)
     rays = [found[name].rays(true[name].project(points)) for name in true]
     return float((triangulate(*rays)[0] - points).norm(dim=-1).square().mean().sqrt())
@@ -149,7 +149,7 @@ def bumped(camera: Camera, turn_rad: Tensor, move_mm: Tensor) -> Camera:
 
 
 def change_of(found: Camera, true: Camera, names: tuple[str, ...]) -> Tensor:
-    """Return the small changes (P,) that take one camera to the other, as `with_parameters` has them."""
+    """Return the small changes (P,) from one camera to the other, as for `with_parameters`."""
     inner_found, inner_true = (getattr(camera, "camera", camera) for camera in (found, true))
     turn = so3.log(true.R_cam_lab @ found.R_cam_lab.mT)
     values = {f"rotation_{axis}": turn[k] for k, axis in enumerate("xyz")}

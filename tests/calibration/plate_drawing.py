@@ -28,7 +28,7 @@ PLATE = DotPlate(
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """A plate before a camera that looks at it along -z of the plate when nothing is turned."""
+    """A plate before a camera that looks at it along -z of the plate where all angles are 0."""
 
     plate: DotPlate = PLATE
     tilt_deg: float = 0.0

@@ -15,7 +15,7 @@ from sphereorient.errors import CameraError
 
 SIZE = (640, 480)
 FINER = 4  # pictures are drawn so many times finer, then averaged
-CORNERS = [[120, 60], [520, 110], [560, 400], [90, 430]]  # where the drawing's corners come to lie, px
+CORNERS = [[120, 60], [520, 110], [560, 400], [90, 430]]  # corners of the drawing in the picture, px
 PARTLY = [[-200, -60], [520, 110], [560, 400], [-250, 430]]
 
 Board = Chessboard | CharucoBoard | CircleGrid
@@ -101,7 +101,7 @@ CHARUCO = CharucoBoard(columns=8, rows=6, pitch_mm=10.0, marker_mm=7.0)
 
 @pytest.mark.parametrize(("corners", "least"), [(CORNERS, 35), (PARTLY, 20)])
 @pytest.mark.parametrize("turn", [0, 2])
-def test_a_charuco_board_is_told_from_a_part_of_it_and_from_any_side(
+def test_a_charuco_board_is_recognised_by_a_part_of_it_and_from_any_side(
     corners: list[list[int]], least: int, turn: int
 ) -> None:
     picture, homography = seen(charuco_drawing(CHARUCO), corners)
@@ -220,7 +220,7 @@ def test_sixteen_bits_are_read_too() -> None:
     assert len(see_plate(picture.astype(np.uint16) * 16, board)) == 42
 
 
-def test_boards_are_read_as_calibration_yaml_says_them() -> None:
+def test_boards_are_read_as_calibration_yaml_defines_them() -> None:
     assert plate_from_entry({"type": "chessboard", "columns": 7, "rows": 6, "pitch": 10.0}) == chess(7, 6)
     charuco = {"type": "charuco", "columns": 8, "rows": 6, "pitch": 10.0, "marker": 7.0, "dictionary": "DICT_4X4_50"}
     assert plate_from_entry(charuco) == CHARUCO
@@ -229,7 +229,7 @@ def test_boards_are_read_as_calibration_yaml_says_them() -> None:
 
 
 @pytest.mark.parametrize(
-    ("entry", "said"),
+    ("entry", "words"),
     [
         ({"type": "chessboard", "columns": 2, "rows": 6, "pitch": 10.0}, "3 x 3 inner corners or more"),
         ({"type": "charuco", "columns": 8, "rows": 6, "pitch": 10.0, "marker": 12.0}, "smaller than its square"),
@@ -249,6 +249,6 @@ def test_boards_are_read_as_calibration_yaml_says_them() -> None:
         ),
     ],
 )
-def test_an_impossible_board_is_refused(entry: dict[str, object], said: str) -> None:
-    with pytest.raises(CameraError, match=said):
+def test_an_impossible_board_is_refused(entry: dict[str, object], words: str) -> None:
+    with pytest.raises(CameraError, match=words):
         plate_from_entry(entry)

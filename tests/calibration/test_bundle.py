@@ -13,7 +13,7 @@ WALLS = {name: port(name) for name in ("cam1", "cam2")}
 
 
 def errors_in_sigmas(fitted, rig):
-    """What is missing to the truth, whitened by the joint covariance of all cameras."""
+    """Error of the cameras, whitened by the joint covariance of all."""
     parts = []
     for name, camera in fitted.rig.cameras.items():
         names = camera.covariance.names
@@ -68,7 +68,7 @@ def test_a_camera_that_never_saw_the_surveyed_pose_is_tied_by_the_others(rng):
 
 
 @pytest.mark.slow
-def test_what_a_port_is_can_be_fitted_and_the_covariance_says_how_well(rng):
+def test_a_port_can_be_fitted_and_the_covariance_states_its_error(rng):
     rig = planted(rng, walls=True, count=10, tilt_deg=35.0, shift_mm=25.0)
     seen = views(rig, rng)
     made = problem(rig, seen, ("port_n_fluid",))
@@ -92,7 +92,7 @@ def test_a_parameter_that_nothing_determines_gets_a_huge_sigma(rng):
 def test_covariances_cover_the_errors_of_200_calibrations(rng):
     rig, squares = planted(rng, count=5), []
     for _ in range(200):
-        fitted = adjust(problem(rig, views(rig, rng)))  # begins at the truth: the fit forgets where it began
+        fitted = adjust(problem(rig, views(rig, rng)))  # begins at the truth: the result does not depend on the start
         squares.append(errors_in_sigmas(fitted, rig).square())
     squares = torch.stack(squares)
     assert 0.93 < float(squares.mean().sqrt()) < 1.07
@@ -102,7 +102,7 @@ def test_covariances_cover_the_errors_of_200_calibrations(rng):
 
 
 @pytest.mark.slow
-def test_the_residuals_tell_the_scale_of_the_covariance_not_the_sigmas_given(rng):
+def test_the_residuals_give_the_scale_of_the_covariance_not_the_sigmas_given(rng):
     rig = planted(rng, count=4)
     seen = views(rig, rng)
     triple = {

@@ -68,11 +68,11 @@ def test_a_change_turns_cameras_in_their_own_frame_and_plates_in_the_lab(rng):
     for same in (0, 1):
         assert_close(moved.R_lab_plate[same], rig.R_lab_plate[same])
     assert_close(moved.cameras["cam1"].R_cam_lab, rig.cameras["cam1"].R_cam_lab)
-    wrong = rig.R_lab_plate[2] @ so3.exp(vector(0.0, 0.0, 0.03))  # the turn read in the plate's frame
+    wrong = rig.R_lab_plate[2] @ so3.exp(vector(0.0, 0.0, 0.03))  # the rotation read in the plate's frame
     assert not torch.allclose(moved.R_lab_plate[2], wrong, atol=1e-4)
 
 
-def test_poses_that_nobody_sees_are_no_unknowns(rng):
+def test_poses_that_no_camera_sees_are_no_unknowns(rng):
     rig = planted(rng, count=4)
     seen = {name: {row: view for row, view in rows.items() if row != 2} for name, rows in views(rig, rng).items()}
     assert problem(rig, seen).free == [1, 3]

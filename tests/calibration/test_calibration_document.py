@@ -83,7 +83,7 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("changes", "words"), FAULTS)
-def test_what_is_wrong_in_the_file_is_said_in_one_line(tmp_path, changes, words):
+def test_faults_of_the_file_are_refused_in_one_line(tmp_path, changes, words):
     path = write(tmp_path, changes, drawn=False)
     with pytest.raises(CameraError, match=words) as caught:
         load_calibration(path)

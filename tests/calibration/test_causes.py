@@ -1,4 +1,4 @@
-"""Cameras that contradict each other: planted faults are found and named; cameras that agree are left in peace."""
+"""Cameras that contradict each other: planted faults are found and named; cameras that agree get no finding."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ OTHERS = [("cam1", 0), ("cam1", 2), ("cam2", 0), ("cam2", 1), ("cam2", 2)]  # ca
 def seen_by(
     cameras: dict[str, Camera], frames: int = 40, diameter_mm: float = MM, seed: int = 1, noise: float = 1.0
 ) -> Seen:
-    """Return what cameras see of a moving sphere, with the noise of fits in unkind light."""
+    """Return the views of a moving sphere, with the noise of fits in poor light."""
     settings = SynthSettings(frames=frames, seed=seed)
     motion = motion_of(settings).at(frame_times_s(settings))
     rng = torch.Generator().manual_seed(seed)
@@ -48,17 +48,17 @@ def seen_by(
 def reported(seen: Seen, cameras: dict[str, Camera]) -> Seen:
     """Return the same pictures as fits with other cameras read them: the view of the sphere stays."""
     R = torch.empty_like(seen.R_lab_body)
-    for k, (true, told) in enumerate(zip(seen.cameras.values(), cameras.values(), strict=True)):
+    for k, (true, given) in enumerate(zip(seen.cameras.values(), cameras.values(), strict=True)):
         view = [
             c.R_cam_lab.mT @ R_cam_view(c.rays(seen.centre_px[:, k]).direction_lab @ c.R_cam_lab.mT)
-            for c in (true, told)
+            for c in (true, given)
         ]
         R[:, k] = view[1] @ view[0].mT @ seen.R_lab_body[:, k]
     return replace(seen, cameras=cameras, R_lab_body=R)
 
 
 def turned(camera: Camera, deg: float, axis: int) -> Camera:
-    """Turn a camera about its own centre."""
+    """Rotate a camera about its own centre."""
     turn = so3.exp(math.radians(deg) * torch.eye(3, dtype=torch.float64)[axis])
     assert isinstance(camera, TsaiCamera)
     return replace(camera, R_cam_lab=turn @ camera.R_cam_lab, T_cam_lab_mm=turn @ camera.T_cam_lab_mm)
@@ -69,7 +69,7 @@ CAMERAS = default_cameras(SynthSettings())
 
 @pytest.mark.parametrize("seed", [0, 1, *map(slow, range(2, 6))])
 @pytest.mark.parametrize("consecutive", [False, True])
-def test_cameras_that_agree_are_left_in_peace(seed, consecutive):
+def test_cameras_that_agree_get_no_finding(seed, consecutive):
     seen = seen_by(CAMERAS, seed=seed)
     found = compare_cameras(replace(seen, frame=torch.arange(len(seen.centre_px)) if consecutive else None), LIMITS)
     assert not found.contradicts
@@ -94,7 +94,7 @@ def test_a_wrong_diameter_is_named_with_the_right_one(percent):
 
 @pytest.mark.parametrize(("name", "axis"), [("cam1", 1), *(slow(*one) for one in OTHERS)])
 def test_a_turned_camera_is_named(name, axis):
-    """Before: 30 of 30 frames valid with 0.03 degrees stated, whichever camera was turned."""
+    """Before: 30 of 30 frames valid with 0.03 degrees stated, whichever camera was rotated."""
     found = compare_cameras(reported(seen_by(CAMERAS), CAMERAS | {name: turned(CAMERAS[name], 1.5, axis)}), LIMITS)
     assert found.contradicts
     assert f"{name} rotated by 1.5 degrees" in found.advice
@@ -106,7 +106,7 @@ def test_a_moved_camera_is_named():
     moved = replace(one, T_cam_lab_mm=one.T_cam_lab_mm + torch.tensor([4.0, 0.0, 0.0]))
     found = compare_cameras(reported(seen_by(CAMERAS), CAMERAS | {"cam2": moved}), LIMITS)
     assert found.contradicts
-    assert "cam2 rotated by 0.4" in found.advice  # 4 mm at 520 mm: this noise does not tell one from the other
+    assert "cam2 rotated by 0.4" in found.advice  # 4 mm at 520 mm: this noise does not distinguish the two
 
 
 def test_swapped_movies_are_deadly():
@@ -142,7 +142,7 @@ def test_wide_pixels_are_named(share):
     assert f"pixels of cam1 and cam2 {100 * share:+.1f} % wider" in found.advice
 
 
-def test_outlines_that_are_wider_than_high_tell_wide_pixels_from_a_wrong_diameter():
+def test_outlines_that_are_wider_than_high_show_wide_pixels_and_no_wrong_diameter():
     """A ball in the middle of the picture: its size alone fits either."""
     seen = seen_by(CAMERAS, diameter_mm=0.985 * MM)
     round_, wide = torch.zeros_like(seen.radius_px), torch.full_like(seen.radius_px, -0.03)
@@ -167,7 +167,7 @@ def test_a_late_movie_is_named(late, frames):
     assert f"the movie of cam2 {abs(late)} frames {'late' if late > 0 else 'early'}" in found.advice
 
 
-def test_a_camera_that_says_nothing_in_some_frames_does_not_matter():
+def test_a_camera_without_measurements_in_some_frames_does_not_matter():
     seen = seen_by(CAMERAS, diameter_mm=1.05 * MM)
     for name in ("centre_px", "radius_px", "R_lab_body"):
         getattr(seen, name)[::2, 1] = torch.nan
@@ -193,7 +193,7 @@ def late(seen: Seen, camera: int) -> Seen:
 
 
 @pytest.mark.parametrize("wrong", [0, slow(1), slow(2)])
-def test_of_three_cameras_the_one_that_contradicts_the_others_is_named_alone(wrong):
+def test_the_one_of_three_cameras_that_contradicts_the_others_is_named_alone(wrong):
     name = list(THREE)[wrong]
     others = tuple(k for k in range(3) if k != wrong)
     turned_one = reported(seen_by(THREE), THREE | {name: turned(THREE[name], 1.5, 0)})
@@ -224,7 +224,7 @@ def test_a_shift_that_two_of_three_cameras_measure_is_decided_by_the_size_in_the
     assert not any(other in advice for other in THREE if other != name)
 
 
-def test_of_four_cameras_two_that_agree_are_no_majority():
+def test_two_of_four_cameras_that_agree_are_no_majority():
     cameras = dict(FOUR)
     for k, name in enumerate(("cam3", "cam4")):
         cameras[name] = turned(FOUR[name], 2.0 + 3 * k, k)

@@ -39,7 +39,7 @@ def track_of(
         cameras[name] = replace(
             track.cameras[name],
             centre_px=(camera.project(X) + off).numpy(),
-            # The middle of two sights of equal error is known to 1e-3 mm.
+            # The middle of two lines of sight of equal error has an error of 1e-3 mm.
             centre_sigma_px=math.sqrt(2) * 1e-3 * radius_px / (MM / 2),
             radius_px=radius_px,
             orientation=(turn @ R).numpy(),
@@ -75,7 +75,7 @@ def test_a_rotation_beyond_five_sigmas_is_marked_and_half_of_it_stated():
 
 
 def test_cameras_may_differ_by_what_lasts_in_each_of_them():
-    """Light that a model lacks turns each camera's rotation in its own way, in all frames alike."""
+    """Light that a model lacks changes each camera's orientation in its own way, in all frames alike."""
     track = track_of({"cam1": 1.0}, {})
     own_rad2 = math.radians(0.5) ** 2 * torch.eye(3, dtype=torch.float64).expand(len(CAMERAS), 3, 3)
     marked, _ = with_contradictions(track, CAMERAS, MM, True, own_rad2)
@@ -84,7 +84,7 @@ def test_cameras_may_differ_by_what_lasts_in_each_of_them():
 
 
 @pytest.mark.parametrize("why", [Reason.CONTRADICTS, Reason.SECOND_BALL])
-def test_a_camera_that_was_believed_alone_may_be_off_by_all_of_it(why):
+def test_a_frame_of_one_camera_alone_has_the_whole_disagreement_as_its_error(why):
     marked, _ = with_contradictions(track_of({"cam2": 1.0}, {}, why), CAMERAS, MM, True)
     assert (marked.flags == Flag.CONTRADICTION).all()
     np.testing.assert_allclose(np.degrees(np.sqrt(marked.orientation_cov[:, 1, 1])), 1.0, rtol=1e-3)
@@ -118,7 +118,7 @@ def test_a_gap_turns_a_pose_between_two_pictures_but_not_that_of_one_camera():
         np.testing.assert_allclose(added, half_mm / (MM / 2) * rolls, rtol=0.02)
 
 
-def test_what_lasts_is_added_by_the_cameras_that_measured_a_frame():
+def test_the_error_that_lasts_is_added_by_the_cameras_that_measured_a_frame():
     rng = np.random.default_rng(5)
     whole, cam1, cam2 = (torch.from_numpy(a @ np.swapaxes(a, -1, -2)) for a in (rng.normal(size=(3, 6, 6))))
     alone = torch.stack([cam1, cam2])
@@ -182,7 +182,7 @@ def test_a_frame_without_a_place_keeps_the_errors_of_its_orientation():
         (Reason.LOW_SCORE, 300.0, None, True),
         (Reason.NOT_FOUND, 300.0, None, True),
         (Reason.OUTLINE, 300.0, np.ones((650, 650), bool), True),
-        (Reason.OUTLINE, 300.0, np.zeros((650, 650), bool), False),  # hidden by what stands there always
+        (Reason.OUTLINE, 300.0, np.zeros((650, 650), bool), False),  # under the mask
         (Reason.LOW_SCORE, 30.0, None, False),  # the edge cuts the disk
         (Reason.LOW_SCORE, 615.0, None, False),
         (Reason.LOW_SCORE, math.nan, None, False),
@@ -191,7 +191,7 @@ def test_a_frame_without_a_place_keeps_the_errors_of_its_orientation():
         (Reason.CONTRADICTS, 300.0, None, False),  # which has a flag of its own
     ],
 )
-def test_a_camera_that_should_show_the_whole_ball_and_does_not_is_noticed(why, u_px, shown, missed):
+def test_a_camera_that_should_show_the_whole_ball_and_does_not_is_found(why, u_px, shown, missed):
     camera = next(iter(CAMERAS.values()))
     scene = SimpleNamespace(shown=shown)
     centre_px, radius_px = torch.tensor([[u_px, 250.0], [300.0, 250.0]]), torch.full((2,), 40.0)
@@ -214,11 +214,11 @@ def test_a_camera_that_two_others_overrule_widens_nothing_and_marks_nothing():
     assert "cam1" not in found.advice
 
 
-def test_of_three_cameras_in_use_one_that_is_off_moves_the_mean_by_a_third():
+def test_one_camera_of_three_that_is_off_moves_the_mean_by_a_third():
     marked, _ = with_contradictions(track_of({"cam3": 1.0}, {}, of=THREE), THREE, MM, True)
     assert (marked.flags == Flag.CONTRADICTION).all()
     sigma = np.degrees(np.sqrt(marked.orientation_cov[:, 0, 0]))
-    # Two pairs tell of it.
+    # Two pairs show it.
     np.testing.assert_allclose(sigma, math.hypot(math.sqrt(2) / 3, math.degrees(SIGMA_RAD) / math.sqrt(2)), rtol=1e-6)
 
 

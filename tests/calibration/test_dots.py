@@ -1,4 +1,4 @@
-"""Dots in pictures: all that are whole, none that are cut, to a few hundredths of a pixel."""
+"""Dots in pictures: all whole ones, no cut ones, to a few hundredths of a pixel."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sphereorient.errors import CameraError, ShapeError
 
 
 def against_truth(dots: Dots, scene: Scene) -> tuple[set[tuple[int, int]], np.ndarray]:
-    """Return which dots were found, and by how much each misses, less the perspective bias."""
+    """Return the found dots and the error of each, less the perspective bias."""
     index = scene.plate.indices
     points, diameter = torch.from_numpy(scene.plate.points(index)), torch.from_numpy(scene.plate.diameters(index))
     shift = disk_centre_shift(scene.camera, scene.R_lab_plate, scene.T_lab_plate, points, diameter).numpy()
@@ -147,15 +147,15 @@ def test_squares_bars_and_half_disks_are_no_dots() -> None:
 
 
 @pytest.mark.parametrize(
-    ("picture", "said"),
+    ("picture", "words"),
     [
         (np.zeros((40, 40, 3)), r"plate picture: expected \(H, W\)"),
         (np.zeros((4, 40)), "of 16 px or more"),
         (np.full((40, 40), np.nan), "got NaN"),
     ],
 )
-def test_what_is_no_grey_picture_is_refused_in_one_line(picture: np.ndarray, said: str) -> None:
-    with pytest.raises(CameraError, match=said) as refused:
+def test_an_array_that_is_no_grey_picture_is_refused_in_one_line(picture: np.ndarray, words: str) -> None:
+    with pytest.raises(CameraError, match=words) as refused:
         find_dots(picture)
     assert "\n" not in str(refused.value)
 

@@ -59,7 +59,7 @@ def test_a_guess_behind_a_wall_finds_focal_length_and_place_of_the_camera_in_air
 
 
 def test_a_camera_that_looks_aslant_through_its_wall_looks_more_aslant_in_air(rng):
-    """By Snell: 12 degrees in air are 8.8 in the liquid, which is what a camera without wall would be turned by."""
+    """By Snell: 12 degrees in air are 8.8 in the liquid, by which a camera without wall would be rotated."""
     aslant = so3.exp(torch.deg2rad(vector(12.0, 0.0, 0.0)))
     true = cameras(walls=True, turned_deg=0.0)["cam1"]
     R = aslant @ true.camera.R_cam_lab
@@ -78,7 +78,7 @@ def test_pixels_that_are_not_square_are_of_the_sensor(rng):
         guess_rig(document(rig, "pinhole", pitch=(0.01, 0.02)), views(rig, rng))
 
 
-def test_two_pictures_are_too_few_and_it_says_so(rng):
+def test_two_pictures_are_refused_as_too_few(rng):
     rig = planted(rng)
     seen = views(rig, rng)
     seen["cam2"] = {row: seen["cam2"][row] for row in (0, 1)}

@@ -1,4 +1,4 @@
-"""Which dots of the plate the dots of a picture are: all told right, or refused with a reason."""
+"""Grid indices of the dots of a picture: all right, or refused with a reason."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sphereorient.errors import CameraError
 
 
 def dots_at(scene: Scene, *, without: tuple[tuple[int, int], ...] = (), jitter_px: float = 0.0, seed: int = 0) -> Dots:
-    """Dots as `find_dots` would give them, by the projection alone: cheap, for many poses."""
+    """Dots as from `find_dots`, by projection alone: quick, for many poses."""
     keep = np.array([tuple(at) in scene.whole() and tuple(at) not in without for at in scene.plate.indices.tolist()])
     index = scene.plate.indices[keep]
     step = 0.5 * scene.plate.diameters(index)[:, None] / scene.plate.pitch_mm
@@ -39,7 +39,7 @@ def dots_at(scene: Scene, *, without: tuple[tuple[int, int], ...] = (), jitter_p
     )
 
 
-def assert_told_right(view: PlateView, scene: Scene, least: int) -> None:
+def assert_indexed_right(view: PlateView, scene: Scene, least: int) -> None:
     assert view.state == "tied", view.reason
     assert view.reason == ""
     assert len(view) >= least
@@ -59,24 +59,24 @@ def assert_told_right(view: PlateView, scene: Scene, least: int) -> None:
     distance=st.floats(170, 300),
     seed=st.integers(0, 10),
 )
-def test_every_pose_that_shows_the_fiducials_is_told_right(
+def test_every_pose_that_shows_the_fiducials_is_indexed_right(
     tilt: float, about: float, spin: float, right: float, down: float, distance: float, seed: int
 ) -> None:
     scene = Scene(tilt_deg=tilt, about_deg=about, spin_deg=spin, at_mm=(right, down), distance_mm=distance, f_px=1000)
     dots = dots_at(scene, jitter_px=0.05, seed=seed)
     view = index_dots(dots, PLATE)
     if set(PLATE.fiducials) <= scene.whole() and len(dots) >= 40:
-        assert_told_right(view, scene, len(dots))
+        assert_indexed_right(view, scene, len(dots))
     elif view.state == "tied":
-        assert_told_right(view, scene, 12)
+        assert_indexed_right(view, scene, 12)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("spin_deg", [slow(0), slow(90), slow(180), slow(270), 37])
-def test_pictures_are_told_right_at_sixty_degrees_and_partial_view(spin_deg: float) -> None:
+def test_pictures_are_indexed_right_at_sixty_degrees_and_partial_view(spin_deg: float) -> None:
     scene = Scene(tilt_deg=60, about_deg=70, spin_deg=spin_deg, at_mm=(16.0, 10.0), distance_mm=190)
     view = see_plate(scene.picture(uneven=0.4), PLATE)
-    assert_told_right(view, scene, len(scene.whole(0.15)))
+    assert_indexed_right(view, scene, len(scene.whole(0.15)))
     assert len(view) < 99
 
 
@@ -95,7 +95,7 @@ def test_missing_dots_leave_gaps_but_no_errors() -> None:
     hole = (*((i, j) for i in (-1, -2) for j in range(-4, 4)), (4, 1), (2, -3))
     scene = Scene(tilt_deg=45, about_deg=30)
     view = see_plate(scene.picture(without=hole), PLATE)
-    assert_told_right(view, scene, 99 - len(hole))
+    assert_indexed_right(view, scene, 99 - len(hole))
 
 
 def test_islands_behind_an_obstacle_are_added_by_the_map_of_the_rest() -> None:
@@ -104,7 +104,7 @@ def test_islands_behind_an_obstacle_are_added_by_the_map_of_the_rest() -> None:
     ring = ((4, -3), (4, -2), (4, -1), (3, -2), (5, -2))
     without = tuple(at for at in ring if at != (4, -2))
     view = index_dots(dots_at(scene, without=without), PLATE)
-    assert_told_right(view, scene, 99 - 4)
+    assert_indexed_right(view, scene, 99 - 4)
     assert (4, -2) in {tuple(at) for at in view.index.tolist()}
 
 
@@ -117,7 +117,7 @@ def test_stray_dots_between_the_rows_are_left_out() -> None:
     stray = stray[clear]
     parts = {name: np.concatenate([getattr(dots, name), getattr(dots, name)[: len(stray)]]) for name in vars(dots)}
     parts["uv_px"] = np.concatenate([dots.uv_px, stray])
-    assert_told_right(index_dots(Dots(**parts), PLATE), scene, 95)
+    assert_indexed_right(index_dots(Dots(**parts), PLATE), scene, 95)
 
 
 @pytest.mark.slow
@@ -132,15 +132,15 @@ def test_a_plate_without_its_fiducials_in_view_floats_and_the_true_place_is_amon
         if np.abs(placed(view, PLATE, p).uv_px - scene.centres_px(placed(view, PLATE, p).index)).max() < 0.5
     ]
     assert len(true) == 1
-    assert_told_right(placed(view, PLATE, true[0]), scene, len(scene.whole(0.15)))
+    assert_indexed_right(placed(view, PLATE, true[0]), scene, len(scene.whole(0.15)))
 
 
 @pytest.mark.slow
 def test_fiducials_hidden_on_a_whole_plate_are_where_dots_are_missing_and_replaced_ones_fit_nowhere() -> None:
     scene = Scene(tilt_deg=30)
     view = see_plate(scene.picture(without=PLATE.fiducials), PLATE)
-    # The other way round small dots would be where fiducials belong.
-    assert_told_right(view, scene, 96)
+    # With the axes exchanged, small dots would be where fiducials belong.
+    assert_indexed_right(view, scene, 96)
     small = see_plate(scene.picture(small=PLATE.fiducials), PLATE)
     assert small.state == "refused"
     assert "larger dots at the grid indices" in small.reason
@@ -167,7 +167,7 @@ def test_a_plate_with_more_dots_than_stated_is_refused(columns: int, rows: int) 
 
 @pytest.mark.slow
 def test_dots_that_stick_out_on_one_side_are_refused_although_their_number_fits() -> None:
-    # 11 x 9 stated, seen is a part of a 15 x 9 plate: 11 columns, but reaching to column 7.
+    # 11 x 9 stated, but the picture shows a part of a 15 x 9 plate: 11 columns, but reaching to column 7.
     large = replace(PLATE, columns=15)
     scene = Scene(plate=large, tilt_deg=20, at_mm=(-34.0, 0.0), distance_mm=230)
     columns = {i for i, _ in scene.whole()}
@@ -203,7 +203,7 @@ ENTRY = {
 }
 
 
-def test_a_plate_is_read_as_calibration_yaml_says_it() -> None:
+def test_a_plate_is_read_as_calibration_yaml_defines_it() -> None:
     plate = plate_from_entry(ENTRY)
     assert plate == PLATE
     assert isinstance(plate, DotPlate)
@@ -217,7 +217,7 @@ def test_a_plate_is_read_as_calibration_yaml_says_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "words"),
     [
         ({"columns": 0}, "plate, columns: expected a whole number"),
         ({"rows": 9.5}, "plate, rows: expected a whole number"),
@@ -232,8 +232,8 @@ def test_a_plate_is_read_as_calibration_yaml_says_it() -> None:
         ({"pich": 8.0}, "unknown pich"),
     ],
 )
-def test_an_impossible_plate_is_refused_in_one_line(change: dict[str, object], said: str) -> None:
-    with pytest.raises(CameraError, match=said) as refused:
+def test_an_impossible_plate_is_refused_in_one_line(change: dict[str, object], words: str) -> None:
+    with pytest.raises(CameraError, match=words) as refused:
         plate_from_entry({**ENTRY, **change})
     assert "\n" not in str(refused.value)
 
@@ -241,7 +241,7 @@ def test_an_impossible_plate_is_refused_in_one_line(change: dict[str, object], s
 @pytest.mark.slow
 @pytest.mark.shared
 @pytest.mark.parametrize("folder", ["experiment", "tank"])
-def test_pictures_of_a_laboratory_are_told_right_to_the_last_dot(folder: str) -> None:
+def test_pictures_of_a_laboratory_are_indexed_right_to_the_last_dot(folder: str) -> None:
     import cv2
     import h5py
     import torch
@@ -251,13 +251,13 @@ def test_pictures_of_a_laboratory_are_told_right_to_the_last_dot(folder: str) ->
     from sphereorient.cameras import load_cameras
 
     place = SHARED / folder / "calibration"
-    said = yaml.safe_load((place / "calibration.yaml").read_text())
-    plate, cameras = plate_from_entry(said["plate"]), load_cameras(SHARED / folder / "cameras.yaml")
+    document = yaml.safe_load((place / "calibration.yaml").read_text())
+    plate, cameras = plate_from_entry(document["plate"]), load_cameras(SHARED / folder / "cameras.yaml")
     assert isinstance(plate, DotPlate)
     with h5py.File(place / "truth.h5") as truth:
         R, T = (torch.from_numpy(truth[name][:]) for name in ("R_lab_plate", "T_lab_plate"))
     misses = []
-    for entry in said["pictures"][3:14:5]:
+    for entry in document["pictures"][3:14:5]:
         k = entry["pose"]
         for name in (name for name in cameras if name in entry):
             view = see_plate(cv2.imread(str(place / entry[name]), cv2.IMREAD_UNCHANGED), plate, entry[name])
@@ -279,7 +279,7 @@ def clicks(scene: Scene, *index: tuple[int, int], off_px: float = 3.0) -> np.nda
     return scene.centres_px(np.array(index)) + np.array([off_px, -off_px])
 
 
-# Covered on both halves, so that the gaps do not give them away.
+# Covered on both halves, so that the gaps do not show them.
 BADLY_SEEN = {"small": PLATE.fiducials, "without": (*PLATE.fiducials, (-3, 0), (0, -2))}
 
 
@@ -291,9 +291,9 @@ def test_clicked_fiducials_tie_a_picture_in_which_they_are_too_small_or_covered(
     dots = find_dots(scene.picture(**{badly: BADLY_SEEN[badly]}), dark=True)
     assert index_dots(dots, PLATE).state != "tied"
     view = index_dots(dots, PLATE, clicked=clicks(scene, *PLATE.fiducials[:count]))
-    assert_told_right(view, scene, len(scene.whole(0.15)) - len(BADLY_SEEN[badly]))
+    assert_indexed_right(view, scene, len(scene.whole(0.15)) - len(BADLY_SEEN[badly]))
     assert not PLATE.is_fiducial(view.index).any()  # a dot that is too small is not measured as a fiducial
-    # A click names a dot: how far beside it does not matter, and no centre moves.
+    # A click names a dot: its distance does not matter, and no centre moves.
     other = index_dots(dots, PLATE, clicked=clicks(scene, *PLATE.fiducials[:count], off_px=-5.0))
     assert np.array_equal(other.uv_px, view.uv_px)
     assert np.array_equal(other.index, view.index)

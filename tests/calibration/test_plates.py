@@ -24,7 +24,7 @@ from sphereorient.report import calibration_figure
 
 PORT = {"offset": 100.0, "thickness": 12.0, "n_glass": 1.49, "n_fluid": 1.36}
 
-# Where the fiducials are, and where they would be half a turn on: without these nobody can tell the two apart.
+# Where the fiducials are, and where they would be half a turn on: without these the two look alike.
 HIDDEN = ((0, 0), (3, 0), (0, 2), (-3, 0), (0, -2))
 
 
@@ -141,7 +141,7 @@ def test_a_picture_without_fiducials_is_tied_through_the_other_camera(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_floating_picture_of_a_pose_that_nobody_else_saw_is_left_out_with_the_reason(tmp_path):
+def test_an_untied_picture_of_a_pose_that_no_other_camera_saw_is_left_out_with_the_reason(tmp_path):
     path = write(tmp_path)
     redrawn(tmp_path, "cam1_04.png", without=HIDDEN)
     result = calibrate_cameras(path)
@@ -158,7 +158,7 @@ def refused(path, words):
 
 
 @pytest.mark.slow
-def test_no_dots_found_is_said_with_the_first_reason(tmp_path):
+def test_a_picture_without_dots_has_the_first_reason(tmp_path):
     path = write(tmp_path)
     for name in pictures():
         if name.startswith("cam2"):
@@ -178,7 +178,7 @@ def test_no_fiducials_in_any_picture_of_a_camera_is_refused(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("columns", "rows"), [(7, 7), (31, 9)])
 def test_a_grid_of_another_size_is_refused_or_does_no_harm(source, tmp_path, columns, rows):
-    """Smaller than what is seen: refused. Larger: the rest may lie outside the picture, the dots are where they are."""
+    """A smaller plate than seen is refused. A larger one may lie partly outside the picture; the dots stay."""
     plate = document()["plate"] | {"columns": columns, "rows": rows}
     path = write(tmp_path, {"plate": plate})
     if columns < 11:
@@ -252,7 +252,7 @@ def test_a_wall_that_does_not_stand_before_the_camera_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_tie_needs_a_pose_that_somebody_knows(source, result):
+def test_a_tie_needs_a_known_pose(source, result):
     document = load_calibration(source)
     views = see_pictures(document, lambda stage, done, total: None)
     rig = Rig(cameras=result.cameras, R_lab_plate=result.R_lab_plate, T_lab_plate_mm=result.T_lab_plate_mm)

@@ -30,7 +30,7 @@ def draws(known, count, rng):
 
 
 def wrong_cameras(rig, known, draw):
-    """The true cameras, where those of the calibration are wrong by a draw."""
+    """The true cameras: those of the calibration, changed by a draw."""
     made = {}
     for name, camera in rig.items():
         own = [k for k, label in enumerate(known.names) if label.startswith(f"{name}.")]
@@ -71,7 +71,7 @@ class Ball:
         self.slope = torch.stack([(self.shown(rig, h) - self.shown(rig, -h)) / 2e-5 for h in steps], dim=-1)
 
     def shown(self, some, pose):
-        """What cameras show of a ball turned and moved: paint, and of the limb its distance from the middle."""
+        """Pictures of a ball rotated and moved: paint, and the limb's distance from the middle."""
         parts = []
         for name, camera in some.items():
             turned = self.paint[name] @ so3.exp(pose[:3]).mT + self.place + pose[3:]
@@ -81,7 +81,7 @@ class Ball:
         return torch.cat(parts)
 
     def error(self, truly):
-        """The small error (6,) of the pose found, where the cameras truly are others: what takes it to the truth."""
+        """The small error (6,) of the pose found with wrong cameras: from it to the truth."""
         pose = torch.zeros(6, dtype=torch.float64)
         seen = self.shown(truly, pose)
         for _ in range(3):
@@ -98,49 +98,49 @@ def test_covariances_are_those_of_brute_force(walls, rng):
     place = torch.tensor([12.0, -20.0, 25.0], dtype=torch.float64)
     ball = Ball(rig, place)
     errors = torch.stack([ball.error(wrong_cameras(rig, known, draw)) for draw in draws(known, 80, rng)])
-    told = systematic_errors(rig, known, place[None], RADIUS)
-    for part, block in ((told[1][0], errors[:, :3]), (told[0][0], errors[:, 3:])):
-        # Whitened by what is told, the errors have unit size in every direction.
+    computed = systematic_errors(rig, known, place[None], RADIUS)
+    for part, block in ((computed[1][0], errors[:, :3]), (computed[0][0], errors[:, 3:])):
+        # Whitened by the computed covariance, the errors have unit size in every direction.
         white = torch.linalg.solve_triangular(torch.linalg.cholesky(part), block.mT, upper=False)
         assert torch.allclose(white.square().mean(1).sqrt(), torch.ones(3).double(), atol=0.3)
         assert abs(float(white.square().mean().sqrt()) - 1) < 0.2
 
 
 def test_a_turn_of_both_cameras_turns_the_ball_and_its_place(rng):
-    """By hand: two cameras turned together by a small angle about lab x, and about the lab's origin."""
+    """By hand: two cameras rotated together by a small angle about lab x, and about the lab's origin."""
     rig = cameras(turned_deg=0.0)
     axis = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
     names, columns = [], []
     for name, camera in rig.items():
         in_camera = camera.R_cam_lab @ axis
         names += [f"{name}.rotation_{which}" for which in "xyz"]
-        # X_cam = R X + T with T as it is: R_new = exp(delta) R is the same as lab points turned about the origin.
+        # X_cam = R X + T with T as it is: R_new = exp(delta) R is the same as lab points rotated about the origin.
         columns.append(in_camera)
     direction = torch.cat(columns)
     sigma = 1e-3
     known = ParameterCovariance(names=tuple(names), matrix=sigma**2 * torch.outer(direction, direction))
     place = torch.tensor([0.0, 30.0, 0.0], dtype=torch.float64)
-    told = systematic_errors(rig, known, place[None], RADIUS)
+    computed = systematic_errors(rig, known, place[None], RADIUS)
     expected_turn, expected_move = torch.zeros(3, 3).double(), torch.zeros(3, 3).double()
     expected_turn[0, 0] = sigma**2
-    expected_move[2, 2] = (sigma * 30.0) ** 2  # turned about x, y = 30 goes along z
-    assert_close(told[1][0], expected_turn, atol=1e-10)
-    assert_close(told[0][0], expected_move, atol=1e-8)
+    expected_move[2, 2] = (sigma * 30.0) ** 2  # rotated about x, y = 30 goes along z
+    assert_close(computed[1][0], expected_turn, atol=1e-10)
+    assert_close(computed[0][0], expected_move, atol=1e-8)
 
 
-def test_between_the_frames_that_are_computed_a_quadratic_tells_the_same(rng):
-    """Of many frames some are computed; of as few as here all."""
+def test_between_the_frames_that_are_computed_a_quadratic_gives_the_same(rng):
+    """With many frames some are computed; with as few as here all."""
     rig, known = cameras(), covariance(rng)
     places = 40 * (2 * torch.rand(400, 3, generator=rng, dtype=torch.float64) - 1)
     direct = systematic_errors(rig, known, places[:100], RADIUS)
     quick = [errors[:100] for errors in systematic_errors(rig, known, places, RADIUS)]
     for both in zip(direct, quick, strict=True):
-        sigmas = [told.diagonal(dim1=-2, dim2=-1).sqrt() for told in both]
+        sigmas = [computed.diagonal(dim1=-2, dim2=-1).sqrt() for computed in both]
         assert float(((sigmas[1] - sigmas[0]).norm(dim=-1) / sigmas[0].norm(dim=-1)).max()) < 0.02
 
 
-def test_frames_that_stand_still_are_told_as_well(rng):
-    """A quadratic through one place only is not determined: it must still tell what was computed there."""
+def test_frames_without_motion_have_systematic_errors_as_well(rng):
+    """A quadratic through one place only is not determined: it must still give what was computed there."""
     rig, known = cameras(), covariance(rng)
     places = torch.tensor([[5.0, 1.0, -3.0]], dtype=torch.float64).expand(400, 3) + 1e-9 * torch.randn(400, 3).double()
     direct = systematic_errors(rig, known, places[:1], RADIUS)
@@ -151,18 +151,18 @@ def test_frames_that_stand_still_are_told_as_well(rng):
 def test_frames_without_a_position_have_no_systematic_error(rng):
     rig, known = cameras(), covariance(rng)
     places = torch.tensor([[0.0, 0, 0], [torch.nan, 0, 0], [1.0, 2, 3]], dtype=torch.float64)
-    told = systematic_errors(rig, known, places, RADIUS)
-    assert torch.isnan(told[0][1]).all()
-    assert torch.isfinite(told[0][[0, 2]]).all()
+    computed = systematic_errors(rig, known, places, RADIUS)
+    assert torch.isnan(computed[0][1]).all()
+    assert torch.isfinite(computed[0][[0, 2]]).all()
     alone = systematic_errors(rig, known, places[2:], RADIUS)
-    assert_close(told[1][2], alone[1][0])
+    assert_close(computed[1][2], alone[1][0])
     empty = systematic_errors(rig, known, places[:0], RADIUS)
     assert empty[0].shape == (0, 3, 3)
 
 
-def test_what_is_exact_in_all_cameras_leaves_nothing(rng):
+def test_exact_cameras_leave_no_systematic_error(rng):
     rig = cameras()
     known = covariance(rng)
     exact = ParameterCovariance(names=known.names, matrix=0 * known.matrix)
-    told = systematic_errors(rig, exact, torch.zeros(1, 3, dtype=torch.float64), RADIUS)
-    assert_close(told[0], torch.zeros(1, 3, 3).double())
+    computed = systematic_errors(rig, exact, torch.zeros(1, 3, dtype=torch.float64), RADIUS)
+    assert_close(computed[0], torch.zeros(1, 3, 3).double())

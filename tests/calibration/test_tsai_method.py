@@ -1,4 +1,4 @@
-"""Tsai's calibration: planted cameras come back, OpenCV agrees, and what cannot be known is refused."""
+"""Tsai's calibration: planted cameras come back, OpenCV agrees, and undetermined parameters are refused."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_a_planted_camera_comes_back(place, kappa1):
 @pytest.mark.parametrize(
     "T_mm", [(0.0, 0.0, 520.0), slow((0.0, 25.0, 520.0)), slow((25.0, 0.0, 520.0)), (400.0, -9e3, 9e2)]
 )
-def test_it_does_not_matter_where_the_labs_origin_appears(place, T_mm):
+def test_the_result_does_not_depend_on_where_the_labs_origin_appears(place, T_mm):
     pitch = (0.02, 0.025)
     camera = planted(T_cam_lab_mm=f64((3.0, -4.0, 520.0)), pixel_pitch_mm=f64(pitch))
     shift = camera.R_cam_lab.mT @ (camera.T_cam_lab_mm - f64(T_mm))  # the same scene in another lab
@@ -135,7 +135,7 @@ def as_pinhole(camera: TsaiCamera) -> PinholeCamera:
 
 
 @pytest.mark.slow
-def test_with_noise_errors_are_as_large_as_the_covariance_says():
+def test_with_noise_errors_are_as_large_as_the_covariance_states():
     camera, points = planted(), in_space()
     squares = []
     for seed in range(12):
@@ -161,7 +161,7 @@ def test_the_last_fit_is_the_least_sum_of_squares(place):
         assert rms_px(replace(found, kappa1=found.kappa1 + 1e-6 * change), points, pixels) > least
 
 
-def test_the_centre_and_sx_are_found_where_they_are_asked_for():
+def test_the_centre_and_sx_are_fitted_where_they_are_free():
     camera = planted(sx=1.01, centre_px=f64((331.0, 318.5)), f_mm=25.0, T_cam_lab_mm=f64((4.0, -3.0, 320.0)))
     points = in_space()
     pixels = camera.project(points)

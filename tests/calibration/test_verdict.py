@@ -1,4 +1,4 @@
-"""The verdict of a calibration: structured residuals, dropped points, lenses beyond belief, and a wall left out."""
+"""The verdict of a calibration: structured residuals, dropped points, impossible lenses, and a wall left out."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from sphereorient.errors import CameraError
 
 
 def fitted(missed_px, used=None, **lens):
-    """A calibration of one camera whose plates are missed by (pictures, dots, 2)."""
+    """A calibration of one camera with residuals (pictures, dots, 2), px."""
     index, reports = PLATE.indices, []
     for row, missed in enumerate(missed_px):
         view = seen_points(PLATE, index, 20.0 * index + 320.0, np.full(len(index), 0.03))
@@ -57,7 +57,7 @@ def test_noise_is_no_structure():
     for seed in range(40):
         assert doubts(fitted(noise(seed=seed))) == {}
     assert doubts(fitted(noise(3))) == {}
-    assert doubts(fitted(structure(0.008))) == {}  # too small to matter
+    assert doubts(fitted(structure(0.008))) == {}  # too small for a finding
 
 
 @pytest.mark.parametrize("size_px", [0.03, 0.1])
@@ -80,7 +80,7 @@ def test_dropped_points_are_counted_and_with_structure_over_the_noise_nothing_is
     assert doubts(fitted(noise(), used)) == {}  # a single outlier
 
 
-def test_centre_and_focal_length_beyond_belief_are_told():
+def test_centre_and_focal_length_beyond_belief_are_reported():
     (words,) = doubts(fitted(noise(), centre_px=torch.tensor([391.5, 289.5], dtype=torch.float64)))["cam1"].words
     assert "76 px off" in words
     (words,) = doubts(fitted(noise(), f_mm=torch.tensor(2000.0, dtype=torch.float64)))["cam1"].words
@@ -99,14 +99,14 @@ def calibrated(monkeypatch, seen, known):
 
 
 def rig_and_views(walls, seed=3, model="tsai"):
-    """What cameras see that look a little aslant at their walls, as in ../shared/tank."""
+    """Views of cameras that look a little aslant at their walls, as in ../shared/tank."""
     rng = torch.Generator().manual_seed(seed)
     rig = replace(planted(rng, model, count=10), cameras=cameras(model, walls, turned_deg=5.0))
     return rig, views(rig, rng)
 
 
 @pytest.mark.slow
-def test_a_plate_behind_a_wall_that_nobody_described_is_told_with_its_cause(monkeypatch):
+def test_a_plate_behind_an_undescribed_wall_is_reported_with_its_cause(monkeypatch):
     """Before: f 48.4 for 35, centre 169 px off, without a message. After: structure of 0.07 px, and its wall."""
     rig, seen = rig_and_views(walls=True)
     *words, cause = calibrated(monkeypatch, seen, document(rig)).verdict
@@ -127,7 +127,7 @@ def test_a_right_calibration_has_no_verdict(monkeypatch, walls):
 
 
 @pytest.mark.slow
-def test_a_lens_of_another_model_is_told(monkeypatch):
+def test_a_lens_of_another_model_is_reported(monkeypatch):
     rig, seen = rig_and_views(walls=False, model="brown")
     *_, cause = calibrated(monkeypatch, seen, document(rig, model="pinhole")).verdict
     assert "is explained by `model: brown` (rms 0.04" in cause
@@ -151,12 +151,12 @@ def test_the_command_marks_doubtful_cameras_and_writes_no_hopeless_ones(tmp_path
     monkeypatch.setattr(sys, "argv", ["sphereorient", "calibrate", str(tmp_path / "calibration.yaml"), "-o", str(out)])
     with pytest.raises(SystemExit) as stop:
         cli.main()
-    printed, said = capsys.readouterr()
+    printed, errors = capsys.readouterr()
     if hopeless:
         assert stop.value.code == 2
-        assert said.strip().splitlines()[-1].startswith("sphereorient: ")  # after the lines of progress
-        assert "got cam1: residuals of neighbouring points agree" in said
-        assert "30 of 300 points were dropped" in said
+        assert errors.strip().splitlines()[-1].startswith("sphereorient: ")  # after the lines of progress
+        assert "got cam1: residuals of neighbouring points agree" in errors
+        assert "30 of 300 points were dropped" in errors
         assert not out.exists()
         return
     assert not stop.value.code

@@ -93,7 +93,7 @@ def behind_port(camera: Camera, **changes: object) -> PortCamera:
 
 
 def level(kappa1: float) -> TsaiCamera:
-    """A camera whose numbers can be worked by hand: f = 10 mm, pixels of 1 mm, axis at pixel (20, 20)."""
+    """A camera for numbers worked by hand: f = 10 mm, pixels of 1 mm, axis at pixel (20, 20)."""
     return TsaiCamera(
         image_size=(41, 41),
         R_cam_lab=torch.eye(3, dtype=torch.float64),

@@ -30,7 +30,7 @@ def test_points_appear_where_opencv_puts_them(rng):
     assert (brown(p=brown().p.flip(0)).project(x_lab_mm) - brown().project(x_lab_mm)).abs().max() > 0.05
 
 
-def test_pixels_are_undistorted_as_opencv_does_it():
+def test_pixels_are_undistorted_as_by_opencv():
     uv_px = whole_picture()
     K, distortion = opencv_parameters(brown())
     slope = (brown().undistort(uv_px) - brown().centre_px) / brown().f_px

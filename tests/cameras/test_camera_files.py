@@ -1,4 +1,4 @@
-"""Camera files of other programs: read as those programs project, named where a key is not used, refused by cause."""
+"""Camera files of other programs: read as those programs project; unused keys named, faults refused by cause."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("name", "text", "message"), REFUSED.values(), ids=REFUSED)
-def test_what_is_not_known_is_refused_by_its_name(tmp_path, name, text, message):
+def test_unknown_keys_are_refused_by_name(tmp_path, name, text, message):
     with pytest.raises(CameraError, match=message) as refused:
         load_camera_files([written(tmp_path / name, text)])
     assert str(tmp_path / name) in str(refused.value)

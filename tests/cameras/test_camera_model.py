@@ -1,4 +1,4 @@
-"""What holds for every camera: pictures of points, lines of sight, and their being inverse."""
+"""Laws of every camera: pictures of points, lines of sight, each the inverse of the other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small changes of named parameters: what the names mean, and the covariance in them."""
+"""Small changes of named parameters: the meaning of the names, and the covariance of the parameters."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_the_camera_is_differentiable_in_the_changes_and_keeps_its_covariance():
     assert behind_port(camera).covariance is covariance
 
 
-def test_a_sample_of_the_covariance_moves_the_camera_by_what_it_says(rng):
+def test_a_sample_of_the_covariance_moves_the_camera_by_its_own_size(rng):
     # u = sx f X / (pitch Z) + c_u: a sigma of 0.02 mm of 45 mm moves a point 40 px from the centre by 0.018 px.
     camera = tsai(0.0, R_cam_lab=torch.eye(3, dtype=torch.float64), T_cam_lab_mm=f64((0.0, 0.0, 500.0)))
     covariance = ParameterCovariance(names=("f", "centre_u"), matrix=f64([[4e-4, 0.0], [0.0, 0.0]]))

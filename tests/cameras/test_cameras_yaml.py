@@ -53,7 +53,7 @@ def test_a_tensor_that_requires_gradients_can_be_saved(tmp_path):
     assert load_cameras(tmp_path / "cameras.yaml")["cam1"].kappa1.item() == 1e-4
 
 
-def test_the_fields_of_the_file_mean_what_the_design_says(tmp_path):
+def test_the_fields_of_the_file_have_the_meaning_of_the_docs(tmp_path):
     camera = load_cameras(written(tmp_path, TSAI.replace("sx: 1.0", "sx: 1.5")))["cam1"]
     assert camera.image_size == (650, 480)
     # 52 mm aside at 520 mm: x_u = 4.5 mm = x_d (1 + 2.2e-4 x_d^2), u = 1.5 x_d / 0.02 + 324.5
@@ -63,12 +63,12 @@ def test_the_fields_of_the_file_mean_what_the_design_says(tmp_path):
     assert uv_px[1].item() == 239.5
 
 
-def test_a_pinhole_takes_the_middle_of_the_picture_unless_told_otherwise(tmp_path):
+def test_a_pinhole_takes_the_middle_of_the_picture_unless_the_file_gives_its_centre(tmp_path):
     camera = load_cameras(written(tmp_path, PINHOLE))["cam1"]
     assert_close(camera.project(f64((0.0, 0.0, 1.0))), f64((191.5, 143.5)))
     assert camera.f_px.item() == pytest.approx(347.6467, abs=1e-4)
-    told = written(tmp_path, PINHOLE.replace("vfov_deg: 45.0", "f_px: 300.0, centre: [192.0, 144.0]"))
-    assert_close(load_cameras(told)["cam1"].project(f64((1.0, 0.0, 1.0))), f64((492.0, 144.0)))
+    given = written(tmp_path, PINHOLE.replace("vfov_deg: 45.0", "f_px: 300.0, centre: [192.0, 144.0]"))
+    assert_close(load_cameras(given)["cam1"].project(f64((1.0, 0.0, 1.0))), f64((492.0, 144.0)))
 
 
 FAULTS = {

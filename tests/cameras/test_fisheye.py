@@ -1,4 +1,4 @@
-"""The fisheye camera: OpenCV's `fisheye` model, up to what lies behind the camera."""
+"""The fisheye camera: OpenCV's `fisheye` model, also behind the camera."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_points_appear_where_opencv_puts_them(rng):
     assert float(np.abs(brown - expected).max()) > 50
 
 
-def test_pixels_see_where_opencv_says():
+def test_rays_of_pixels_agree_with_opencv():
     camera, uv_px = own(), whole_picture()
     uv_px = uv_px[((uv_px - camera.centre_px) / camera.f_px).norm(dim=-1) < 1.5]  # OpenCV stops at pi / 2
     sure = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-14)
@@ -166,7 +166,7 @@ def test_faults_of_the_file_are_one_line(tmp_path, keys, message):
 
 
 def opencv_text(**changed: str) -> str:
-    """Return what OpenCV's sample, or ROS, writes."""
+    """Return a file as OpenCV's sample, or ROS, writes it."""
     whole = {"image_width": "640", "image_height": "480"} | changed
     lines = [f"{key}: {value}" for key, value in whole.items()]
     for key, shape, data in (
@@ -188,7 +188,7 @@ def opencv_text(**changed: str) -> str:
         ({}, 568.94),
     ],
 )
-def test_the_file_says_which_lens_its_four_numbers_are_of(tmp_path, key, u):
+def test_the_file_names_the_lens_of_its_four_numbers(tmp_path, key, u):
     (tmp_path / "cam.yml").write_text(opencv_text(**key))
     camera = load_opencv(tmp_path / "cam.yml")
     assert float(camera.project(f64((321.394, 0.0, 383.022)))[0]) == pytest.approx(u, abs=0.01)

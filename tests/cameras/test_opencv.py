@@ -51,7 +51,7 @@ def test_numbers_are_read_to_the_last_bit(tmp_path, suffix):
     ],
     ids=["matrix", "vector"],
 )
-def test_what_opencv_writes_is_read(tmp_path, distortion, pose):
+def test_files_of_opencv_are_read(tmp_path, distortion, pose):
     camera = load_opencv(opencv_file(tmp_path / "cam.xml", distortion_coefficients=distortion, **pose))
     x_lab_mm = np.array([[10.0, -20.0, 30.0], [-60.0, 5.0, 0.0]])
     expected, _ = cv2.projectPoints(x_lab_mm, np.array(ROTVEC), np.array(T_MM), K, D)
@@ -66,7 +66,7 @@ def test_without_a_pose_the_lab_is_the_camera_and_four_coefficients_end_with_p2(
     assert camera.p.tolist() == [2e-3, -1.5e-3]
 
 
-def test_a_size_that_the_file_does_not_say_is_given(tmp_path):
+def test_a_size_that_the_file_lacks_is_given(tmp_path):
     path = opencv_file(tmp_path / "cam.yml", image_width=None, image_height=None)
     assert load_opencv(path, image_size=SIZE).image_size == SIZE
     with pytest.raises(CameraError, match="two whole numbers, got none"):

@@ -19,7 +19,7 @@ from sphereorient.cameras.brown import OpenPTVCamera
 from sphereorient.cameras.io.openptv import PtvPar, load_openptv, load_ptv_par
 from sphereorient.errors import CameraError
 
-# The layout that OpenPTV writes: centre, angles, matrix (which nobody reads), shift and distance, glass vector.
+# The layout that OpenPTV writes: centre, angles, matrix (not read), shift and distance, glass vector.
 ORI = """  105.26320000 102.74580000 403.88220000
     -0.23832910   0.24428100   0.05525770
 
@@ -115,7 +115,7 @@ YAML = "num_cams: 1\nptv:\n  splitter: false\n  img_name: [a, b]\n  imx: 1280\n 
 YAML += "  pix_y: 0.011\n  chfield: 0\n  mmp_n1: 1.0\n  mmp_n2: 1.49\n  mmp_n3: 1.33\n  mmp_d: 6.0\n  hp_flag: true\n"
 
 
-def test_openptvs_yaml_and_lists_of_four_names_say_the_same_as_ptv_par(tmp_path):
+def test_openptvs_yaml_and_lists_of_four_names_give_the_same_as_ptv_par(tmp_path):
     _, _, par = files(tmp_path, par=PAR + TANK)
     (tmp_path / "parameters_Run1.yaml").write_text(YAML)
     (tmp_path / "padded.par").write_text(PAR.replace("cal/cam2.tif\n", "cal/cam2.tif\n\n\n---\n---\n") + TANK)
@@ -153,7 +153,7 @@ def test_the_glass_vector_and_the_media_become_a_port(tmp_path):
     camera = load_openptv(ori, load_ptv_par(par), addpar)
     assert isinstance(camera, PortCamera)
     assert_close(camera.port.normal, f64((0.0001, 0.00001, 150.0)) / 150, atol=1e-9)
-    # Snell's law knows ratios only: 1.25 : 1.5 is 1 : 1.2.
+    # Snell's law depends on ratios only: 1.25 : 1.5 is 1 : 1.2.
     numbers = [camera.port.offset_mm, camera.port.thickness_mm, camera.port.n_glass, camera.port.n_fluid]
     assert_close(torch.stack(numbers), f64((150.0, 6.0, 1.2, 1.2)), atol=1e-9)
     uv_px = whole_picture((1280, 1024), steps=3)

@@ -60,7 +60,7 @@ def test_a_ray_at_45_degrees_bends_at_both_faces_as_worked_by_hand():
     # sin 45 = 0.70711; glass: sin 0.47140, tan 0.53452; liquid: sin 0.53166, cos 0.84696
     assert_close(rays.origin_lab_mm, f64((100 + 10 * 0.5345224838, 0.0, 0.0)), atol=1e-8)
     assert_close(rays.direction_lab, f64((0.5316592, 0.0, -0.8469584)), atol=1e-7)
-    # The other way round the glass would bend the ray as the liquid does.
+    # With the indices exchanged, the glass would bend the ray as the liquid does.
     swapped = overhead(n_glass=1.33, n_fluid=1.5).rays(f64((300.0, 200.0)))
     assert abs(swapped.direction_lab[0].item() - 0.4714045) < 1e-7
 
@@ -159,7 +159,7 @@ def test_glass_as_dense_as_the_liquid_is_more_liquid(rng):
 
 
 class Disguised:
-    """A camera of the protocol whose one centre nobody knows of."""
+    """A camera of the protocol without a known perspective centre."""
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
@@ -168,7 +168,7 @@ class Disguised:
         return getattr(self.camera, name)
 
 
-def test_a_camera_whose_centre_is_not_known_sees_the_same(rng):
+def test_a_camera_whose_centre_is_not_known_has_the_same_lines_of_sight(rng):
     known = behind_port(tsai())
     unknown = PortCamera(camera=Disguised(tsai()), port=known.port)
     x_lab_mm = in_liquid(rng, 50)
@@ -238,7 +238,7 @@ def test_straight_below_the_camera_gradients_are_finite_even_of_second_order(dty
     assert torch.isfinite(second).all()
 
 
-def test_what_the_camera_is_in_air_passes_through():
+def test_properties_of_the_camera_in_air_pass_through():
     camera = behind_port(tsai())
     assert camera.image_size == SIZE
     assert camera.R_cam_lab is camera.camera.R_cam_lab
@@ -269,7 +269,7 @@ def test_a_normal_of_three_digits_counts_as_a_direction_only(rng):
         ({"normal": turned()[2]}, "port: expected a camera before the wall"),
     ],
 )
-def test_what_is_no_wall_is_refused_in_one_line(changes, message):
+def test_an_impossible_wall_is_refused_in_one_line(changes, message):
     with pytest.raises(CameraError, match=message) as refused:
         behind_port(tsai(), **changes)
     assert "\n" not in str(refused.value)

@@ -1,4 +1,4 @@
-"""Which light made a grey level."""
+"""The response of a camera: light of a grey level."""
 
 from __future__ import annotations
 

@@ -121,10 +121,10 @@ def test_the_point_of_three_rays_has_the_least_squares_of_distances(rng):
     rays = [aside(one, rng) for one in (*seen(x_lab_mm), C.rays(C.project(x_lab_mm)))]
     point, gap = nearest_point(rays)
     for k in range(5):
-        # Oracle: lstsq of what each ray says of the two components across it.
+        # Oracle: lstsq of each ray's two components across it.
         across = [np.linalg.svd(ray.direction_lab[k].numpy()[None])[2][1:] for ray in rays]
-        says = [rows @ ray.origin_lab_mm[k].numpy() for rows, ray in zip(across, rays, strict=True)]
-        expected = np.linalg.lstsq(np.concatenate(across), np.concatenate(says), rcond=None)[0]
+        sides = [rows @ ray.origin_lab_mm[k].numpy() for rows, ray in zip(across, rays, strict=True)]
+        expected = np.linalg.lstsq(np.concatenate(across), np.concatenate(sides), rcond=None)[0]
         np.testing.assert_allclose(point[k].numpy(), expected, atol=1e-8)
     assert_close(gap, torch.stack([triangulate(rays[k], rays[m])[1] for k, m in ((0, 1), (0, 2), (1, 2))]).amax(0))
 

@@ -30,7 +30,7 @@ def test_its_last_column_is_the_direction_to_the_sphere():
     R = R_cam_view(f64((3.0, 0.0, 4.0)))
     assert_close(R @ Z, f64((0.6, 0.0, 0.8)))
     assert_close(R, f64([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]]))
-    # The paper's R_persp, read in a frame with z forward, turns the other way: its transpose fails.
+    # The paper's R_persp, read in a frame with z forward, rotates the other way: its transpose fails.
     assert not torch.allclose(R.mT @ Z, f64((0.6, 0.0, 0.8)))
 
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 
-def test_one_pixel_is_as_many_mm_as_the_scale_says_right_and_down():
+def test_one_pixel_is_as_many_mm_as_the_scale_right_and_down():
     camera = telecentric(R_cam_lab=torch.eye(3, dtype=torch.float64), T_cam_lab_mm=f64((0.0, 0.0, 0.0)))
     assert_close(camera.project(f64((0.23, 0.46, 7.0))), f64((332.0, 230.5)))
     # The scale the other way round, px per mm, would move it by a twentieth of that.

@@ -95,7 +95,7 @@ def test_a_distortion_that_folds_inside_the_picture_is_refused():
         ({"image_size": (650.5, 480)}, "image_size: expected two whole numbers"),
     ],
 )
-def test_what_is_no_camera_is_refused_in_one_line(changes, message):
+def test_an_impossible_camera_is_refused_in_one_line(changes, message):
     with pytest.raises(CameraError, match=message) as refused:
         tsai(**changes)
     assert "\n" not in str(refused.value)

@@ -34,11 +34,11 @@ def bumped(calibrated):
 
 
 def track_of(calibrated, truly, contradicts=0):
-    """What a track made with `calibrated` says of a ball that cameras `truly` filmed."""
+    """The track, made with `calibrated`, of a ball that cameras `truly` filmed."""
     rng = torch.Generator().manual_seed(6)
     places = 20 * (2 * torch.rand(FRAMES, 3, generator=rng).double() - 1)
     R = so3.exp(2 * torch.randn(FRAMES, 3, generator=rng).double())
-    says = {}
+    alone = {}
     for name, true in truly.items():
         centre = true.project(places) + 0.02 * torch.randn(FRAMES, 2, generator=rng).double()
         turn = calibrated[name].R_cam_lab.mT @ true.R_cam_lab
@@ -46,14 +46,14 @@ def track_of(calibrated, truly, contradicts=0):
         reason = [Reason.OK] * FRAMES
         if name == "cam2":
             reason[:contradicts] = [Reason.CONTRADICTS] * contradicts
-        says[name] = replace(
+        alone[name] = replace(
             CameraTrack.empty(FRAMES),
             centre_px=centre.numpy(),
             orientation=(wobble @ turn @ R).numpy(),
             reason=tuple(str(why) for why in reason),
         )
-    empty = Trajectory.empty(np.arange(FRAMES) / 600.0, cameras=tuple(says), frame_rate=600.0, experiment="test")
-    return replace(empty, cameras=says)
+    empty = Trajectory.empty(np.arange(FRAMES) / 600.0, cameras=tuple(alone), frame_rate=600.0, experiment="test")
+    return replace(empty, cameras=alone)
 
 
 @pytest.mark.slow
@@ -69,7 +69,7 @@ def test_calibrate_writes_cameras_and_a_picture_and_prints_tables(tmp_path, monk
     assert "sphereorient calibrate" in (tmp_path / "cameras.yaml").read_text().splitlines()[0]
 
 
-def test_what_a_user_can_mend_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, capsys):
+def test_a_fault_that_a_user_can_mend_is_one_line_and_nothing_is_written(tmp_path, monkeypatch, capsys):
     path = write(tmp_path, {"surveyed": document()["surveyed"] | {"pose": 99}}, drawn=False)
     code, out, err = command(monkeypatch, capsys, "calibrate", path, "--out", tmp_path / "cameras.yaml")
     assert code == 2
@@ -146,7 +146,7 @@ def test_a_track_of_other_cameras_or_of_one_is_refused(tmp_path):
         refine_with_track(tmp_path / "cameras.yaml", tmp_path / "one.h5")
 
 
-def test_check_cameras_tells_gaps_of_lines_of_sight_in_mm_and_px():
+def test_check_cameras_prints_gaps_of_lines_of_sight_in_mm_and_px():
     calibrated = cameras()
     (right,) = check_cameras(calibrated, track_of(calibrated, calibrated))
     (wrong,) = check_cameras(calibrated, track_of(calibrated, bumped(calibrated)))
@@ -159,7 +159,7 @@ def test_check_cameras_tells_gaps_of_lines_of_sight_in_mm_and_px():
     assert "px" in line
 
 
-def test_only_frames_in_which_both_cameras_tell_are_counted():
+def test_only_frames_that_both_cameras_measured_are_counted():
     calibrated = cameras()
     track = track_of(calibrated, calibrated)
     reason = ("not_found",) * 50 + track.cameras["cam1"].reason[50:]
@@ -168,12 +168,12 @@ def test_only_frames_in_which_both_cameras_tell_are_counted():
     assert len(check.gap_mm) == FRAMES - 50
 
 
-@pytest.mark.parametrize(("contradicts", "told"), [(0, False), (20, False), (100, True)])
-def test_cameras_that_contradict_each_other_most_of_the_time_are_told_of(contradicts, told):
+@pytest.mark.parametrize(("contradicts", "reported"), [(0, False), (20, False), (100, True)])
+def test_cameras_that_contradict_each_other_most_of_the_time_are_reported(contradicts, reported):
     calibrated = cameras()
     lines = contradiction_lines(track_of(calibrated, calibrated, contradicts))
-    assert bool(lines) is told
-    if told:
+    assert bool(lines) is reported
+    if reported:
         assert f"in {contradicts} of the {FRAMES} frames" in lines[0]
         assert "--refine-with" in lines[1]
 

@@ -68,11 +68,11 @@ def test_the_errors_of_a_track_are_printed(track):
 
 
 def test_a_constant_turn_of_the_body_axes_is_named_and_taken_off(track):
-    """As of a learnt map: errors of 150 degrees, and one rotation explains them."""
+    """As with a learnt map: errors of 150 degrees, explained by one rotation."""
     loaded, turn = Trajectory.load(track), Rotation.from_rotvec([2.0, 1.5, -0.8]).as_matrix()
     with h5py.File(TRUTH) as file:
         rates = {key: file[key][()] for key in ("omega_lab", "omega_body", "alpha_body") if key in file}
-    rates |= {key: rates[key] @ turn for key in ("omega_body", "alpha_body")}  # components in axes that are turned
+    rates |= {key: rates[key] @ turn for key in ("omega_body", "alpha_body")}  # components in axes that are rotated
     off = Rotation.from_rotvec([0.01, 0.0, 0.0]).as_matrix() @ loaded.orientation @ turn
     off[3] = np.nan
     cov = np.tile(np.eye(3) * 0.01**2, (40, 1, 1))
@@ -82,7 +82,7 @@ def test_a_constant_turn_of_the_body_axes_is_named_and_taken_off(track):
     assert "--align body" in plain.stderr
     assert "--align body" not in body.stderr
     found = score_track(Trajectory.load(track), TRUTH, "body")
-    assert found.percentiles_deg()[3] < 1.2  # 0.01 rad in the lab; the turn takes some of it
+    assert found.percentiles_deg()[3] < 1.2  # 0.01 rad in the lab; the rotation takes some of it
     assert found.over_stated()[0] < 1.2
     assert found.relative_rms["omega_body"] == pytest.approx(0.0, abs=0.03)
     assert found.relative_rms["omega_lab"] == pytest.approx(0.0, abs=1e-9)
@@ -156,7 +156,7 @@ TURN = Rotation.from_euler("xyz", [0.3, -0.5, 0.8]).as_matrix()
 
 @pytest.fixture
 def on_a_ball(tmp_path: Path) -> Trajectory:
-    """The track of a ball in its place, 200 frames, whose turns about y are too small by 3 %; its truth and FicTrac's
+    """The track of a fixed ball, 200 frames, whose rotations about y are too small by 3 %; its truth and FicTrac's
     table, in other axes, beside it.
     """
     rng = np.random.default_rng(4)
@@ -196,8 +196,8 @@ def test_the_gain_against_truth_another_track_and_fictracs_table_is_that_of_the_
     assert not of_fictrac["exact"]
     assert of_fictrac["pairs"] == 197  # frame 50 is not in it
     assert of_fictrac["gain"]["value"][:3] == pytest.approx([1.0, 0.97, 1.0], abs=2e-3)
-    told = CliRunner().invoke(app, ["score", str(tmp_path / "track.h5"), str(tmp_path / "theirs.dat")]).output
-    assert "--align both" in told
+    printed = CliRunner().invoke(app, ["score", str(tmp_path / "track.h5"), str(tmp_path / "theirs.dat")]).output
+    assert "--align both" in printed
     moving = replace(on_a_ball, position=np.arange(600.0).reshape(200, 3))  # by its own positions only
     moving.save(tmp_path / "moving.h5")
     assert scored(tmp_path / "moving.h5", tmp_path / "truth.h5")["length_ratio"] == pytest.approx(0.97, abs=0.02)
@@ -209,7 +209,7 @@ def test_the_gain_against_truth_another_track_and_fictracs_table_is_that_of_the_
 
 
 def test_the_table_that_is_exported_of_a_track_is_that_track(on_a_ball, tmp_path):
-    """Its counter begins at 0, as FicTrac's: from 1 on each frame was compared with the one beside it."""
+    """Its counter begins at 0, as FicTrac's. Before: it began at 1, and each frame was compared with the next one."""
     table = fictrac_table(on_a_ball, FicTracAxes.of_lab(TURN))
     np.savetxt(tmp_path / "own.dat", table, delimiter=", ")
     found = scored(tmp_path / "track.h5", tmp_path / "own.dat", "--align", "both")
@@ -228,16 +228,16 @@ def test_a_table_whose_counter_begins_anew_is_cut_there(on_a_ball, tmp_path):
     assert found["gain"]["value"][:3] == pytest.approx([1.0, 0.97, 1.0], abs=2e-3)
 
 
-def test_behaviour_is_printed_and_a_short_track_says_why_not(on_a_ball, tmp_path):
-    told = CliRunner().invoke(app, ["score", str(tmp_path / "track.h5"), str(tmp_path / "truth.h5")]).output
-    assert "0.9700" in told
-    assert all(word in told for word in ("gain, smoothed", "drift (degrees a minute)", "ratio of path lengths"))
-    told = (
+def test_behaviour_is_printed_and_for_a_short_track_the_reason(on_a_ball, tmp_path):
+    printed = CliRunner().invoke(app, ["score", str(tmp_path / "track.h5"), str(tmp_path / "truth.h5")]).output
+    assert "0.9700" in printed
+    assert all(word in printed for word in ("gain, smoothed", "drift (degrees a minute)", "ratio of path lengths"))
+    printed = (
         CliRunner()
         .invoke(app, ["score", str(tmp_path / "theirs.dat"), str(tmp_path / "truth.h5"), "--align", "both"])
         .output
     )
-    assert "1.0000 .. 1.0000" in told
+    assert "1.0000 .. 1.0000" in printed
     on_a_ball[:40].save(tmp_path / "short.h5")
     short = scored(tmp_path / "short.h5", tmp_path / "truth.h5")
     assert short["gain"]["value"] == [None] * 4

@@ -39,7 +39,7 @@ def options(folder):
 
 @pytest.mark.slow
 def test_a_spin_is_measured_and_written(flight, monkeypatch, capsys):
-    code, said, err = command(
+    code, output, err = command(
         monkeypatch, capsys, "spin", flight / "pictures", *options(flight), "--dot-radius", 7, "--omega-max", 700
     )
     assert code == 0, err
@@ -49,12 +49,12 @@ def test_a_spin_is_measured_and_written(flight, monkeypatch, capsys):
     assert first["rate_sigma_rad_s"] < 6.0
     assert [one["file"].rsplit("/", 1)[1] for one in result["photographs"]] == [f"{k}.png" for k in range(6)]
     assert all(one["residual_deg"] < 8 for one in result["photographs"])
-    assert "6 of 6 follow the spin" in said
+    assert "6 of 6 follow the spin" in output
     assert cv2.imread(str(flight / "spin.png")).shape[1] > 500
 
 
 @pytest.mark.parametrize(
-    ("changed", "says"),
+    ("changed", "words"),
     [
         ({"times.csv": "name,time\n"}, "the columns file and t_s"),
         ({"times.csv": "file,t_s\n0.png,0\n"}, "a time of 1.png"),
@@ -68,17 +68,17 @@ def test_a_spin_is_measured_and_written(flight, monkeypatch, capsys):
         ({"pictures/3.png": "no picture"}, "a picture that can be decoded"),
     ],
 )
-def test_inputs_that_are_damaged_are_refused_in_one_line(flight, monkeypatch, capsys, changed, says):
+def test_inputs_that_are_damaged_are_refused_in_one_line(flight, monkeypatch, capsys, changed, words):
     for name, content in changed.items():
         (flight / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     code, _, err = command(monkeypatch, capsys, "spin", flight / "pictures", *options(flight))
     assert code == 2
-    assert says in err
+    assert words in err
     assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "words"),
     [
         (("--times", "0"), "a rate above 0"),
         (("--times", "nan"), "a rate above 0"),
@@ -89,10 +89,10 @@ def test_inputs_that_are_damaged_are_refused_in_one_line(flight, monkeypatch, ca
         (("--texture", "missing.png"), "no such file"),
     ],
 )
-def test_options_that_are_impossible_are_refused_in_one_line(flight, monkeypatch, capsys, arguments, says):
+def test_options_that_are_impossible_are_refused_in_one_line(flight, monkeypatch, capsys, arguments, words):
     code, _, err = command(monkeypatch, capsys, "spin", flight / "pictures", *options(flight), *arguments)
     assert code == 2
-    assert says in err
+    assert words in err
     assert err.count("\n") == 1
 
 

@@ -86,18 +86,18 @@ def test_cameras_of_unknown_place_are_written_without_one_and_unread_keys_are_na
     (tmp_path / "a.yaml").write_text(text + "rms: 0.2\n")
     (tmp_path / "b.yaml").write_text(text + "rms: 0.3\nflags: 10\n")
     out = tmp_path / "cameras.yaml"
-    said = convert(tmp_path / "a.yaml", tmp_path / "b.yaml", "--out", out).output
-    assert "not read: rms, flags\n" in said
-    assert "no R and T in the files: a, b; write them into" in said
+    log = convert(tmp_path / "a.yaml", tmp_path / "b.yaml", "--out", out).output
+    assert "not read: rms, flags\n" in log
+    assert "no R and T in the files: a, b; write them into" in log
     with pytest.raises(CameraError, match="a, R and T"):
         load_cameras(out)
-    said = convert(tmp_path / "a.yaml", "--out", out, "--force").output
-    assert "no R and T in the files: a; the lab is the camera's frame" in said
+    log = convert(tmp_path / "a.yaml", "--out", out, "--force").output
+    assert "no R and T in the files: a; the lab is the camera's frame" in log
     assert torch.equal(load_cameras(out)["a"].R_cam_lab, torch.eye(3, dtype=torch.float64))
 
 
 def test_the_distance_of_two_cameras_shows_the_unit(folder):
     sizes = ("--image-size", "650,480")
-    said = convert(folder / "left.yml", folder / "right.xml", "--out", folder / "cameras.yaml", *sizes).output
+    log = convert(folder / "left.yml", folder / "right.xml", "--out", folder / "cameras.yaml", *sizes).output
     centres = [-cv2.Rodrigues(np.array([0, f / 1000, 0]))[0].T @ (f, 0, 0) for f in (700.0, 710.0)]
-    assert f"T taken as mm: the first and the last camera are {np.linalg.norm(centres[1] - centres[0]):.4g} mm" in said
+    assert f"T taken as mm: the first and the last camera are {np.linalg.norm(centres[1] - centres[0]):.4g} mm" in log

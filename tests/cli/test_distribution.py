@@ -1,4 +1,4 @@
-"""What is uploaded: the wheel and the source distribution, used in an environment of their own."""
+"""The wheel and the source distribution, used in an environment of their own."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def python(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of an environment with the wheel, what it requires, and no extra."""
+    """The interpreter of an environment with the wheel, its requirements, and no extra."""
     folder = tmp_path_factory.mktemp("environment")
     venv.create(folder, with_pip=False, symlinks=True)
     own = Path(sysconfig.get_path("purelib", vars={"base": str(folder)}))
     (wheel,) = built.glob("*.whl")
     pip = [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python")]
     subprocess.run([*pip, "install", "-q", "--no-deps", "--no-index", str(wheel)], check=True)
-    # What the wheel requires is here already; the project's folder is not on this path.
+    # The wheel's requirements are installed already; the project's folder is not on this path.
     (own / "required.pth").write_text(sysconfig.get_path("purelib") + "\n")
     hidden = "".join(f"sys.modules[{name!r}] = None\n" for name in EXTRAS)
     (own / "sitecustomize.py").write_text(f"import sys\n{hidden}")
@@ -69,7 +69,7 @@ def test_the_wheel_tracks_reports_and_exports_without_an_extra(python, tmp_path)
 
 
 @pytest.mark.slow
-def test_wheel_and_source_hold_what_they_should(built):
+def test_wheel_and_source_distribution_hold_the_right_files(built):
     (wheel,), (source,) = built.glob("*.whl"), built.glob("*.tar.gz")
     names = zipfile.ZipFile(wheel).namelist()
     assert all(name.startswith("sphereorient") for name in names)  # no tests, no data

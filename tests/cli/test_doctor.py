@@ -1,4 +1,4 @@
-"""`doctor`: what it says of a machine that is in order, and of ones where something is broken."""
+"""`doctor` on a machine in order, and on machines with a fault."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SEEN = {"opencv": ["camera:0 (640 x 480 px)"], "pylon": "no answer within 10 s"}
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    """One small ball, and cameras that are known."""
+    """One small ball, and calibrated cameras."""
     monkeypatch.setattr("sphereorient.bench.doctor.LIMITS_DEG", {40.0: 0.3})
     monkeypatch.setattr("sphereorient.bench.doctor.cameras_here", lambda: SEEN)
 
@@ -39,15 +39,15 @@ def command(monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", ["sphereorient", *words])
         with pytest.raises(SystemExit) as stopped:
             main()
-        told = capsys.readouterr()
-        return int(stopped.value.code or 0), told.out, told.err.splitlines()
+        printed = capsys.readouterr()
+        return int(stopped.value.code or 0), printed.out, printed.err.splitlines()
 
     return run
 
 
-def test_a_machine_in_order_is_told_as_one_object(command):
-    code, said, errors = command("doctor", "--json")
-    found = json.loads(said)
+def test_a_machine_in_order_is_printed_as_one_object(command):
+    code, output, errors = command("doctor", "--json")
+    found = json.loads(output)
     assert (code, errors, found["broken"]) == (0, [], [])
     assert found["torch"] == version("torch")
     assert found["cameras"] == SEEN
@@ -60,10 +60,10 @@ def test_a_machine_in_order_is_told_as_one_object(command):
 
 
 def test_findings_are_printed(no_fit, command):
-    code, said, errors = command("doctor")
+    code, output, errors = command("doctor")
     assert (code, errors) == (0, [])
     for words in ("torch ", "camera:0 (640 x 480 px)", "pylon: no answer", "hz_free_core", "cores free"):
-        assert words in said
+        assert words in output
 
 
 @pytest.mark.slow
@@ -76,22 +76,22 @@ def test_a_fit_that_is_wrong_by_a_degree_is_broken(monkeypatch):
 
 def test_a_frame_without_a_pose_is_broken(monkeypatch, command):
     monkeypatch.setattr("sphereorient.bench.doctor.fit_speed", lambda px: FIT | {"error_deg": float("nan")})
-    code, said, errors = command("doctor", "--json")
-    found = json.loads(said)
+    code, output, errors = command("doctor", "--json")
+    found = json.loads(output)
     assert (code, errors) == (1, [])
     assert found["live_one_camera"][0]["error_deg"] is None
     assert found["broken"][0].startswith("fit of a ball of 40 px: ")
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("no kernel")], ids=str)
-def test_a_fit_that_cannot_be_tried_is_broken_and_the_rest_is_told(monkeypatch, command, error):
+def test_a_fit_that_cannot_be_tried_is_broken_and_the_rest_is_reported(monkeypatch, command, error):
     def fails(px: float) -> dict[str, float]:
         raise error
 
     monkeypatch.setattr("sphereorient.bench.doctor.fit_speed", fails)
-    code, said, errors = command("doctor")
+    code, output, errors = command("doctor")
     assert code == 1
-    assert "camera:0 (640 x 480 px)" in said
+    assert "camera:0 (640 x 480 px)" in output
     (line,) = errors
     assert line.startswith("broken: fit of a ball of 40 px: ")
     assert str(error.args[-1]) in line
@@ -112,11 +112,11 @@ def test_a_package_too_old_is_one_line_with_the_command_that_mends_it(no_fit, mo
     monkeypatch.setattr(
         "sphereorient.files.provenance.version", lambda name: "0.8" if name == "kornia" else version(name)
     )
-    code, said, errors = command("doctor")
+    code, output, errors = command("doctor")
     assert code == 1
     (line,) = errors
     assert "got 0.8; run `pip install 'kornia>=0.9.0'`" in line
-    assert "hz" not in said, "nothing that it measured could be trusted"
+    assert "hz" not in output, "nothing that it measured could be trusted"
 
 
 def test_a_package_that_is_missing_or_does_not_load_is_one_line(monkeypatch, command):
@@ -127,13 +127,13 @@ def test_a_package_that_is_missing_or_does_not_load_is_one_line(monkeypatch, com
 
     monkeypatch.setattr("sphereorient.files.provenance.version", gone)
     monkeypatch.setitem(sys.modules, "h5py", None)
-    code, said, errors = command("doctor", "--json")
+    code, output, errors = command("doctor", "--json")
     assert (code, errors) == (1, [])
-    found = json.loads(said)
+    found = json.loads(output)
     missing, damaged = found["broken"]
     assert missing.startswith("av: expected >=")
     assert damaged.startswith("h5py: ")
-    assert "pyzmq" in found["not_installed"]["live"], "an extra is told, but breaks nothing"
+    assert "pyzmq" in found["not_installed"]["live"], "an extra is reported, but breaks nothing"
 
 
 @pytest.mark.slow

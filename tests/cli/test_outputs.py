@@ -1,4 +1,4 @@
-"""What the commands write over, and what they say where memory is short."""
+"""Files that the commands replace, and their message where memory is short."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def place(tmp_path) -> Path:
     (folder / "marked.yaml").write_text(text.replace("texture.png", "marked.png"))
     true_track().save(folder / "track.h5")
     for path in folder.iterdir():
-        os.utime(path, (1, 1))  # no longer as this process left it
+        os.utime(path, (1, 1))  # changed since this process wrote it
     return folder
 
 
@@ -74,10 +74,10 @@ def state(folder: Path) -> dict[str, bytes]:
 def test_an_input_is_never_replaced(command, place, monkeypatch, words, got, force):
     monkeypatch.chdir(place)
     before = state(place)
-    code, said = command(*words.split(), *force)
+    code, errors = command(*words.split(), *force)
     assert code == 2
-    assert len(said) == 1, said
-    assert f"got {got}" in said[0]
+    assert len(errors) == 1, errors
+    assert f"got {got}" in errors[0]
     assert state(place) == before
 
 
@@ -85,10 +85,10 @@ def test_an_input_is_never_replaced(command, place, monkeypatch, words, got, for
 def test_a_file_of_others_is_not_replaced_by_a_table(command, place, name):
     """Before: `export` put a table in the place of the experiment and of a movie, exit code 0."""
     before = state(place)
-    code, said = command("export", place / "track.h5", "--to", "csv", "--out", place / name)
+    code, errors = command("export", place / "track.h5", "--to", "csv", "--out", place / name)
     assert code == 2
-    assert len(said) == 1
-    assert "without its mark" in said[0]
+    assert len(errors) == 1
+    assert "without its mark" in errors[0]
     assert state(place) == before
     assert command("export", place / "track.h5", "--to", "csv", "--out", place / name, "--force", "-q") == (0, [])
     assert has_mark(place / name)
@@ -137,14 +137,14 @@ def test_every_command_that_writes_has_force():
     ],
     ids=["numpy", "torch", "python", "torch on Windows"],
 )
-def test_memory_that_is_not_there_is_one_line(command, monkeypatch, ask):
+def test_missing_memory_is_refused_in_one_line(command, monkeypatch, ask):
     """Before: a traceback and exit code 1; so `track` of the excerpt with 1.3 GB (ulimit -v 1300000)."""
     monkeypatch.setattr("sphereorient.files.provenance.versions", lambda: ask() and {})
-    code, said = command("doctor")
+    code, errors = command("doctor")
     assert code == 2
-    assert len(said) == 1
-    assert said[0].startswith("sphereorient: memory: ")
-    assert "fewer --jobs" in said[0]
+    assert len(errors) == 1
+    assert errors[0].startswith("sphereorient: memory: ")
+    assert "fewer --jobs" in errors[0]
 
 
 def test_other_errors_keep_their_traceback(monkeypatch):

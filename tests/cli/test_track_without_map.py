@@ -1,4 +1,4 @@
-"""`sphereorient track` of a ball that stays in its place, and of which there is no map."""
+"""`sphereorient track` of a fixed ball without a map."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ SMALL |= {"volume_mm": 30.0, "exposure": 0.0001, "exposure_samples": 1}
 
 
 def mean_turn(deg: float, frame_rate: float = 600.0) -> float:
-    """Return the omega_rms, rad/s, at which the ball turns on average by that much from frame to frame."""
+    """Return the omega_rms, rad/s, of a mean rotation by this angle from frame to frame."""
     return float(np.deg2rad(deg) * frame_rate / np.sqrt(8 / np.pi))
 
 
@@ -39,7 +39,7 @@ def mean_turn(deg: float, frame_rate: float = 600.0) -> float:
 class Movies:
     """An experiment in memory with its truth, N frames; spoilt by tests, written by `write`."""
 
-    folder: Path  # of what does not change: cameras, texture, pictures without the ball
+    folder: Path  # of unchanged files: cameras, texture, pictures without the ball
     pictures: Mapping[str, Pictures]  # (N, H, W) each
     position_mm: Floats  # (N, 3), NaN where there is no ball
     R_lab_body: Floats  # (N, 3, 3)
@@ -80,7 +80,7 @@ def render(folder: Path, **changed: Any) -> Movies:
 
 
 def write(movies: Movies, folder: Path, **keys: Any) -> Path:
-    """Write movies as .npy beside a copy of what they need; keys: of experiment.yaml, None takes one away."""
+    """Write movies as .npy beside a copy of their other files; keys: of experiment.yaml, None takes one away."""
     folder.mkdir(parents=True, exist_ok=True)
     for path in movies.folder.iterdir():
         if path.suffix in (".png", ".yaml"):

@@ -1,4 +1,4 @@
-"""Inputs that failed once, of ../shared/cases, with the right answer: poses."""
+"""Inputs of ../shared/cases that failed once, with the right poses."""
 
 from __future__ import annotations
 

@@ -53,8 +53,8 @@ class Scene:
     position_lab_mm: Tensor  # (N, 3)
 
     def sight(self, change: Tensor) -> Rays:
-        told = (self.cameras[0], with_parameters(self.cameras[1], NAMES, change))
-        both = [camera.rays(self.uv_px) for camera in told]
+        given = (self.cameras[0], with_parameters(self.cameras[1], NAMES, change))
+        both = [camera.rays(self.uv_px) for camera in given]
         origin, direction = ([getattr(rays, part) for rays in both] for part in ("origin_lab_mm", "direction_lab"))
         return Rays(origin_lab_mm=torch.stack(origin), direction_lab=torch.stack(direction))
 
@@ -104,7 +104,7 @@ def chain(scene: Scene, theta: Tensor, iterations: int = 20) -> tuple[SoftTrack,
     off = so3.exp(f64([[0.02, -0.01, 0.02], [-0.01, 0.02, 0.01], [0.25, -0.3, 0.5]]))
     start = (off @ scene.R_lab_body[:, None]).flatten(0, 1)
     place = scene.position_lab_mm.repeat_interleave(3, 0)
-    place[3 * EMPTY] = torch.nan  # nothing is known of an empty frame
+    place[3 * EMPTY] = torch.nan  # an empty frame has no position
     use = there.repeat_interleave(3)
     fit = implicit_pose(residual, start, place, use=use, iterations=iterations)
     track = soft_track(
@@ -135,7 +135,7 @@ def gradients(scene: Scene, iterations: int = 20) -> tuple[Tensor, Tensor]:
     return both.detach(), torch.stack(rows)
 
 
-THETA = (0.01, 2.0, 0.2)  # rad, px, paint: told wrong, so that residuals are left
+THETA = (0.01, 2.0, 0.2)  # rad, px, paint: given wrong, so that residuals are left
 STEPS = (1e-5, 1e-2, 1e-4)  # of the differences; the third order they leave out is below 1e-6
 
 
@@ -154,7 +154,7 @@ def test_the_chain_is_what_it_should_be(scene):
     with torch.no_grad():
         track, picture = chain(scene, f64([0.0, 0.0, 0.0]))
     there = torch.arange(FRAMES) != EMPTY
-    # Noise is all that is left; each camera's candidate has its share, and the false one has none.
+    # Only noise is left; each camera's candidate has its share, and the false one has none.
     assert 0.9 < picture.square().mean().sqrt() < 1.1
     assert so3.geodesic_distance(track.R_lab_body, scene.R_lab_body)[there].max() < 0.02
     assert (track.marginals[there][:, :2] > 0.1).all()
@@ -230,7 +230,7 @@ def test_gradcheck_of_the_soft_track(rng):
     assert torch.autograd.gradcheck(track, inputs)
 
 
-def test_what_does_not_belong_together_is_refused(rng):
+def test_inconsistent_arguments_are_refused(rng):
     R, X, misfit = candidates(rng, 4, 3)
     mask = torch.ones(4, 3, dtype=torch.bool)
     with pytest.raises(ShapeError, match="misfit"):

@@ -32,8 +32,8 @@ def rows_of(*more: str) -> dict[str, dict[str, Any]]:
     words = [sys.executable, REPO / "scripts" / "faults.py", "--json", *more]
     run = subprocess.run(words, capture_output=True, text=True, timeout=1500, check=False)
     assert run.returncode == 0, run.stderr
-    told = json.loads(run.stdout)
-    return {row["fault"]: row | {"clean_worst_deg": told["clean_worst_deg"]} for row in told["rows"]}
+    result = json.loads(run.stdout)
+    return {row["fault"]: row | {"clean_worst_deg": result["clean_worst_deg"]} for row in result["rows"]}
 
 
 def most_worse(fault: str) -> float:
@@ -48,7 +48,7 @@ def check(row: dict[str, Any], frames: int = 96) -> None:
     assert row["good_lost"] == 0
     assert row["reasons_elsewhere"] == 0
     assert row["worst_deg"] < most_worse(row["fault"]) * row["clean_worst_deg"]
-    assert row["same"]  # with what the clean run had learnt: the same bits in all blocks without the fault
+    assert row["same"]  # with the appearance of the clean run: the same bits in all blocks without the fault
 
 
 @pytest.mark.slow
@@ -56,7 +56,7 @@ def test_a_fault_costs_its_own_frames_only():
     """The shortest movie with a block before, with and after the fault; all faults, at full length, are slow."""
     row = rows_of("--frames", "48", "--only", "black, cam1")["black, cam1"]
     check(row, 48)
-    # What 42 frames tell in place of 48 differs by sqrt(6 / 42) of what lasts, half a sigma: 0.19.
+    # An estimate from 42 frames in place of 48 differs by sqrt(6 / 42) of the error that lasts, half a sigma: 0.19.
     assert row["anew_rms_sigma"] <= 0.13
 
 
@@ -74,7 +74,7 @@ def test_each_fault_costs_its_own_frames_only(everything, name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in EXPECTED if name != "cam2 a frame late from here on"])
 def test_good_frames_are_the_same_to_a_tenth_of_a_sigma_when_all_is_learnt_anew(everything, name):
-    # A frame beside lost ones knows less of the path that its orientation follows; cam2 tells of 21 frames less.
+    # A frame beside lost ones has a less certain path for its orientation; cam2 reports 21 frames less.
     bars = {"out of view": (0.125, 0.4), "truncated movie, cam2": (0.11, 0.45)}
     rms_sigma, most_sigma = bars.get(name, (0.11, 0.3))
     assert everything[name]["anew_rms_sigma"] <= rms_sigma
@@ -93,7 +93,7 @@ def test_a_ball_half_out_of_view_is_measured_as_well_as_its_half_allows(everythi
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["30 % of each camera black", "30 % of each camera lost, stamps"])
 def test_a_third_of_the_frames_lost_costs_those_frames(everything, name):
-    """Nine in a hundred instants nobody saw; all others are measured."""
+    """No camera saw nine in a hundred instants; all others are measured."""
     row = everything[name]
     seen_by_none = row["frames"] - row["valid"]
     assert row["good_lost"] == 0

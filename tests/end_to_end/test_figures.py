@@ -1,4 +1,4 @@
-"""Figures of the docs: each page with numbers is named, tables go where they belong, and older ones are told."""
+"""Figures of the docs: each page with numbers is named, tables go where they belong, and older ones are reported."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import kept
 import pytest
 from conftest import REPO
 
-# Pages whose tables hold numbers that nobody measured: formats, sources, settings' meanings, lists of findings.
+# Pages whose tables hold numbers that were not measured: formats, sources, settings' meanings, lists of findings.
 NOT_MEASURED = {
     "check.md", "data-format.md", "export.md", "model.md", "movies.md", "parameters.md", "degradations.md"
 }  # fmt: skip
@@ -18,12 +18,12 @@ NOT_MEASURED = {
 
 def test_each_page_with_numbers_is_named_in_figures_md():
     named = {page for figure in figures.FIGURES.values() for page in figure.pages}
-    said = (REPO / "docs" / "figures.md").read_text()
+    text = (REPO / "docs" / "figures.md").read_text()
     for page in sorted((REPO / "docs").glob("*.md")):
         rows = re.findall(r"^\|.*\d\.\d.*\|$", page.read_text(), re.MULTILINE)
         if len(rows) > 1 and page.name not in NOT_MEASURED | {"figures.md"}:
             assert page.name in named, page
-            assert f"[{page.name}]" in said, page
+            assert f"[{page.name}]" in text, page
 
 
 def test_each_mark_is_one_pair_and_each_command_is_there():
@@ -88,7 +88,7 @@ def test_a_film_depends_on_synth_and_not_on_trackers():
     assert REPO / "sphereorient" / "pose" / "refine.c" in whole
 
 
-def test_what_was_noted_beside_a_file_is_read_again(tmp_path):
+def test_a_note_beside_a_file_is_read_back(tmp_path):
     made = tmp_path / "track.h5"
     assert kept.known(made) == {}
     kept.note(made, key="a", cpu_s=3.0)

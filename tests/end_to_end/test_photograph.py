@@ -1,4 +1,4 @@
-"""One photograph as input: from `init` to a track, against the truth of a rendered still; and what is refused."""
+"""One photograph as input: from `init` to a track, against the truth of a rendered picture; and refusals."""
 
 from __future__ import annotations
 
@@ -121,11 +121,11 @@ def test_a_single_telecentric_camera_is_refused(still, tmp_path):
         run("track", out, "--out", tmp_path / "t.h5", "-q")
 
 
-def test_the_field_of_view_is_asked_for_not_assumed(still, tmp_path):
+def test_a_missing_field_of_view_is_refused_and_not_assumed(still, tmp_path):
     out, cameras = tmp_path / "experiment.yaml", tmp_path / "cameras.yaml"
-    said = run("init", photograph(still), "--out", out, "--sphere-map", still / "texture.png")
-    assert "write in cameras.yaml: cameras.cam1.vfov_deg" in said
-    assert "degrees" in said
+    printed = run("init", photograph(still), "--out", out, "--sphere-map", still / "texture.png")
+    assert "write in cameras.yaml: cameras.cam1.vfov_deg" in printed
+    assert "degrees" in printed
     with pytest.raises(CameraError, match="vfov_deg"):
         load_cameras(cameras)
     run("init", photograph(still), "--out", out, "--vfov", 12, "-q")  # its own draft is written anew

@@ -1,4 +1,4 @@
-"""The precise method from movies to track, on movies with exact truth: what can go wrong, and is found out."""
+"""The precise method from movies to track, on movies with exact truth: faults are found and marked."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def brisk(rendered: Rendered) -> Movies:
 
 @pytest.fixture
 def held(rendered: Rendered) -> Movies:
-    """120 frames of a ball that turns in one place: frames left out make its orientation jump and nothing else."""
+    """120 frames of a fixed ball: frames left out make its orientation jump and nothing else."""
     return rendered(omega_rms=mean_turn(3.0), velocity_rms=0.0, seed=9)
 
 
@@ -101,7 +101,7 @@ def rms(z: np.ndarray) -> float:
 
 
 def check_nothing(track: Trajectory, rows: np.ndarray) -> None:
-    """None of these frames has a measurement, and each camera says why."""
+    """None of these frames has a measurement, and each camera has a reason."""
     assert not track.valid[rows].any()
     for name in ("position", "position_cov", "orientation", "orientation_cov", "confidence"):
         assert np.isnan(getattr(track, name)[rows]).all(), name
@@ -141,13 +141,13 @@ def test_the_excerpt_is_tracked_by_each_camera_alone(name):
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_each_camera_also_says_what_it_sees_by_itself(excerpt, name):
+def test_each_camera_also_gives_the_pose_that_it_measures_alone(excerpt, name):
     score = score_track(excerpt, EXCERPT / "truth.h5")
     assert np.median(score.camera_orientation_deg[name]) < 0.2
     assert set(excerpt.cameras[name].reason) == {Reason.OK}
 
 
-# Fast turns.
+# Fast rotation.
 
 
 @pytest.mark.slow
@@ -182,7 +182,7 @@ def test_after_a_gap_of_12_frames_and_44_degrees_the_track_goes_on(brisk, tmp_pa
     check_nothing(track, gap)
     assert np.flatnonzero(track.flags & Flag.RECOVERED).tolist() == [first + 12]
     assert np.flatnonzero(track.flags & Flag.EXTRAPOLATED).tolist() == gap.tolist()
-    # One motion, so the smoother fills the gap, and knows how well.
+    # One motion, so the smoother fills the gap, with its covariance.
     assert set(track.segment) == {0}
     assert angle_deg(track.orientation_smooth, brisk.R_lab_body)[gap].max() < 1.0
     sigma = np.sqrt(np.trace(track.orientation_smooth_cov, axis1=1, axis2=2))
@@ -204,7 +204,7 @@ def test_when_both_cameras_are_blind_for_20_frames_nothing_is_invented(brisk, tm
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "along"), [("cam1", 2), ("cam2", 1)])
-def test_when_one_camera_is_blind_the_other_goes_on_and_says_so(brisk, tmp_path, name, along):
+def test_when_one_camera_is_blind_the_other_goes_on_and_the_flag_is_set(brisk, tmp_path, name, along):
     """`along`: the lab axis along which the camera that is left looks."""
     blind = np.arange(50, 70)
     track = followed(brisk.without_ball(blind, (name,)), tmp_path)
@@ -213,7 +213,7 @@ def test_when_one_camera_is_blind_the_other_goes_on_and_says_so(brisk, tmp_path,
     reasons = track.cameras[name].reason
     assert {reasons[k] for k in blind} <= {Reason.NOT_FOUND, Reason.LOW_SCORE}
     assert {reasons[k] for k in rest(brisk, blind)} == {Reason.OK}
-    # The distance is known from the size alone: less well, and the covariance says how much.
+    # The distance comes from the size alone: its error is larger, and the covariance states it.
     sigma = np.sqrt(np.diagonal(track.position_cov, axis1=1, axis2=2))
     across = [axis for axis in range(3) if axis != along]
     assert np.median(sigma[blind][:, along]) > 8 * np.median(sigma[blind][:, across])
@@ -234,7 +234,7 @@ def test_30_percent_of_the_frames_dropped_cost_no_other_frame(brisk, tmp_path):
 
 @pytest.mark.slow
 def test_30_percent_dropped_in_each_camera_by_itself(brisk, tmp_path):
-    """A camera that comes back is used at once, whatever the other one does in that frame."""
+    """A camera that sees the ball again is used at once, with or without the other one."""
     rng = np.random.default_rng(0)
     one, other = (rng.choice(len(brisk), 36, replace=False) for _ in CAMERAS)
     neither = np.intersect1d(one, other)
@@ -266,14 +266,14 @@ def test_frames_of_another_attitude_do_not_draw_the_track_away(held, tmp_path):
     movies = held.frames(np.r_[0:30, 90:93, 33:80, 105, 81:90])
     spliced = np.array([30, 31, 32, 80])
     track = followed(movies, tmp_path, lost=spliced)
-    # What the pictures show there may pass for a measurement or for a fault, but not for a smooth motion.
+    # These pictures may pass for a measurement or for a fault, but not for a smooth motion.
     off = turned_off(track, movies)[spliced]
     assert (np.isnan(off) | (off < 0.4)).all()
     assert (~track.valid[spliced] | (track.flags[spliced] & (Flag.SPIKE | Flag.RECOVERED | Flag.AMBIGUOUS) > 0)).all()
 
 
 def with_more_noise(movie: np.ndarray) -> np.ndarray:
-    """Make each picture one of its own: a camera never takes the same twice, and who sees that takes it for a fault."""
+    """Make each picture different: a repeated picture counts as a fault."""
     more = np.random.default_rng(4).integers(0, 3, movie.shape, dtype=np.uint8)
     return np.clip(movie.astype(np.int16) + more - 1, 0, 255).astype(np.uint8)
 
@@ -329,15 +329,15 @@ def test_pictures_out_of_focus_by_a_seventh_of_the_radius_are_tracked(brisk, tmp
 
 
 @pytest.mark.slow
-def test_the_blur_of_soft_pictures_is_learnt_as_well_as_told_and_a_told_one_is_used(brisk, tmp_path):
+def test_the_blur_of_soft_pictures_is_learnt_and_a_given_one_is_used(brisk, tmp_path):
     movies = soft(brisk, 0.95)
-    told = [() if blur is None else (f"refine.blur_px={blur}",) for blur in (None, 1.13, 0.625)]
-    folders = [tmp_path / str(k) for k in range(len(told))]
+    options = [() if blur is None else (f"refine.blur_px={blur}",) for blur in (None, 1.13, 0.625)]
+    folders = [tmp_path / str(k) for k in range(len(options))]
     for folder in folders:
         folder.mkdir()
-    found = [tracked(movies, folder, *given) for folder, given in zip(folders, told, strict=True)]
+    found = [tracked(movies, folder, *given) for folder, given in zip(folders, options, strict=True)]
     learnt, right, wrong = (np.median(turned_off(track, movies)) for track in found)
-    print(f"learnt {learnt:.4f}, told {right:.4f}, told wrongly {wrong:.4f} degrees")
+    print(f"learnt {learnt:.4f}, given {right:.4f}, given wrongly {wrong:.4f} degrees")
     assert learnt < 1.15 * right
     assert wrong > 1.5 * right
     assert 0.6 < rms(in_sigmas(rotation_error(found[0], movies), found[0].orientation_cov)) < 1.4
@@ -345,7 +345,7 @@ def test_the_blur_of_soft_pictures_is_learnt_as_well_as_told_and_a_told_one_is_u
 
 @pytest.mark.slow
 def test_a_mirrored_map_is_refused_of_soft_pictures_too(brisk, tmp_path):
-    """Any pose explains most of a blurred disk: what counts is how much more the best one does."""
+    """Any pose explains most of a blurred disk: only the surplus of the best one counts."""
     path = write(soft(brisk.frames(slice(0, 40)), 0.14 * 25.0), tmp_path)
     texture = path.with_name("texture.png")
     cv2.imwrite(str(texture), np.ascontiguousarray(cv2.imread(str(texture), cv2.IMREAD_GRAYSCALE)[:, ::-1]))
@@ -355,7 +355,7 @@ def test_a_mirrored_map_is_refused_of_soft_pictures_too(brisk, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CAMERAS)
-def test_one_camera_alone_loses_no_frame_and_knows_what_it_does_not_see(brisk, tmp_path, name):
+def test_one_camera_alone_loses_no_frame_and_its_covariance_shows_the_unseen_direction(brisk, tmp_path, name):
     track = followed(brisk, tmp_path, cameras=(name,))
     assert list(track.cameras) == [name]
     assert 0.5 < rms(in_sigmas(track.position - brisk.position_mm, track.position_cov)) < 1.8
@@ -384,7 +384,7 @@ def test_movies_of_a_few_frames_are_tracked(short, tmp_path, count):
     if count == 1:
         assert np.isnan(track.omega_lab).all()
         assert np.isnan(track.velocity).all()
-    # What there is of derivatives is not nonsense: 4.5 degrees a frame are 47 rad/s.
+    # The few derivatives are right: 4.5 degrees a frame are 47 rad/s.
     assert not (np.abs(track.omega_lab) > 300).any()
 
 
@@ -437,8 +437,8 @@ def test_two_runs_give_the_same_bytes_with_one_thread_or_two(short, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_a_block_measures_does_not_depend_on_the_blocks_beside_it(short, tmp_path, monkeypatch):
-    """Chunks, workers and a run begun again at a block are all this: windows of other blocks."""
+def test_measurements_of_a_block_do_not_depend_on_the_blocks_beside_it(short, tmp_path, monkeypatch):
+    """Chunks, workers and a resumed run are all windows of other blocks."""
     made: list[BallTracker] = []
 
     class Kept(BallTracker):
@@ -456,8 +456,8 @@ def test_what_a_block_measures_does_not_depend_on_the_blocks_beside_it(short, tm
     def poses_of(*blocks: int) -> list[str]:
         """Follow blocks, by number, in one window."""
         rows = np.concatenate([np.arange(16 * block, 16 * block + 16) for block in blocks])
-        shots = [[Frame(shown=picture) for picture in movie[rows]] for movie in pictures]
-        return [_digest(row[""]) for row in tracker.track(shots, [16] * len(blocks), (rows / 600.0).tolist())]
+        frames = [[Frame(shown=picture) for picture in movie[rows]] for movie in pictures]
+        return [_digest(row[""]) for row in tracker.track(frames, [16] * len(blocks), (rows / 600.0).tolist())]
 
     each = [poses_of(block) for block in range(3)]
     assert [poses_of(block) for block in (2, 0, 1)] == [each[2], each[0], each[1]]
@@ -476,7 +476,7 @@ def _digest(poses: Poses) -> str:
 
 @pytest.mark.slow
 def test_frames_of_the_first_blocks_do_not_depend_on_how_the_movie_is_decoded(short, tmp_path):
-    """The same pictures from FFV1 and from .npy, whichever thread read them."""
+    """The same pictures from FFV1 and from .npy, read by any thread."""
     from_npy = track_movies(write(short, tmp_path))
     from_video = track_movies(short.folder / "experiment.yaml")
     for name in ("position", "orientation", "orientation_cov", "omega_lab", "segment", "flags", "confidence"):

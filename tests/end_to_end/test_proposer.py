@@ -1,4 +1,4 @@
-"""A trained network that proposes: the pipeline cannot tell it from the template search."""
+"""A trained network as proposer: the pipeline measures as well as with the template search."""
 
 from __future__ import annotations
 

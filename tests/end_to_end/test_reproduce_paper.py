@@ -1,4 +1,4 @@
-"""The script that redoes the paper: its movies move as stated, it refuses what it cannot use, and the page is whole."""
+"""The script that redoes the paper: its movies move as stated, unusable ones are refused, and the page is whole."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_a_broken_folder_of_movies_is_refused_in_one_line(tmp_path, monkeypatch)
         assert {"expected", "got"} <= set(re.findall(r"\w+", line))
 
 
-def test_what_a_stage_made_stays_until_its_own_code_changes(tmp_path, monkeypatch):
+def test_results_of_a_stage_stay_until_its_own_code_changes(tmp_path, monkeypatch):
     plan = reproduce_paper.QUICK
     for number, stage in ((1, "film"), (2, "film"), (1, "paper"), (1, "precise"), (2, "precise")):
         made = reproduce_paper.made_by(tmp_path, number, stage)
@@ -158,7 +158,7 @@ def test_the_paper_runs_nothing_of_what_its_key_leaves_out():
             ran.add(frame.f_code.co_filename)
 
     experiment = load_experiment(REPO / "synthetic_data" / "excerpt" / "experiment.yaml")
-    track_movies(replace(experiment, frames=(0, 12)), method="paper")  # what runs at imports does not count
+    track_movies(replace(experiment, frames=(0, 12)), method="paper")  # code that runs at imports does not count
     threading.setprofile(look)
     sys.setprofile(look)
     try:
@@ -180,8 +180,8 @@ def test_a_full_disk_ends_in_one_line_and_no_movie_is_half_made(tmp_path):
     full = {"preexec_fn": lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, 500_000))}
     run = subprocess.run(script, capture_output=True, text=True, **full)
     assert run.returncode == 1
-    said = run.stderr.strip().splitlines()
-    assert [line for line in said if line.startswith("reproduce_paper.py: ")] == said[-1:], said
+    errors = run.stderr.strip().splitlines()
+    assert [line for line in errors if line.startswith("reproduce_paper.py: ")] == errors[-1:], errors
     assert [path.name for path in (tmp_path / "movies").iterdir() if not path.name.endswith(".part")] == []
 
 

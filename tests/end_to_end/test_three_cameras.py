@@ -1,4 +1,4 @@
-"""Three cameras: a camera that contradicts the others is found by majority, and told by name."""
+"""Three cameras: a camera that contradicts the others is found by majority and reported by name."""
 
 from __future__ import annotations
 
@@ -71,21 +71,21 @@ def test_three_cameras_are_better_than_two_of_them(rendered, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["cam1", "cam3"])
-def test_a_moved_camera_is_left_out_and_told(rendered, tmp_path, name):
+def test_a_moved_camera_is_left_out_and_reported(rendered, tmp_path, name):
     off = torch.tensor([1.5, 0.0, 0.0], dtype=torch.float64)
     track = tracked(rendered, tmp_path, name, lambda one: replace(one, T_cam_lab_mm=one.T_cam_lab_mm + off))
     only_blames(track, name)
     assert score_track(track, rendered / "truth.h5").percentiles_mm()[1] < 0.03
 
 
-def test_a_turned_camera_is_left_out_and_told(rendered, tmp_path):
+def test_a_turned_camera_is_left_out_and_reported(rendered, tmp_path):
     turn = so3.exp(torch.deg2rad(torch.tensor([0.8, 0.8, 0.8], dtype=torch.float64)))
     track = tracked(rendered, tmp_path, "cam2", lambda one: replace(one, R_cam_lab=one.R_cam_lab @ turn))
     only_blames(track, "cam2")
     assert score_track(track, rendered / "truth.h5").percentiles_deg()[1] < 0.15
 
 
-def test_a_movie_out_of_step_is_left_out_and_told(rendered, tmp_path):
+def test_a_movie_out_of_step_is_left_out_and_reported(rendered, tmp_path):
     track = tracked(rendered, tmp_path, start={"cam1": 1})
     only_blames(track, "cam1", slice(FRAMES - 1))
     assert score_track(track, rendered / "truth.h5").percentiles_deg()[1] < 0.15

@@ -91,7 +91,7 @@ def test_the_excerpt_meets_the_bars_of_the_paper_method(tracked):
     assert score.relative_rms["velocity"] <= 0.05
 
 
-def test_the_summary_says_what_is_valid_and_what_each_camera_lost(tracked):
+def test_the_summary_counts_valid_frames_and_the_losses_of_each_camera(tracked):
     _, run = tracked
     assert "40 of 40 frames valid" in run.stdout
     assert "cam1: frames lost: none" in run.stdout
@@ -170,7 +170,7 @@ def test_the_python_call_gives_the_same_bytes_as_the_command(tmp_path):
 
 
 @pytest.mark.slow
-def test_one_camera_alone_tracks_the_orientation_and_says_so(tmp_path):
+def test_one_camera_alone_tracks_the_orientation_and_the_flag_is_set(tmp_path):
     out, experiment = tmp_path / "one.h5", shortened(tmp_path / "copy", 0, 12)
     run = sphereorient("track", experiment, "--method", "paper", "--out", out, "--cameras", "cam2", "--quiet")
     assert run.returncode == 0, run.stderr

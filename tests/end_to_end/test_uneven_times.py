@@ -53,7 +53,7 @@ def test_jittered_and_dropped_frames_are_tracked_by_their_times(fast, tmp_path):
     assert np.nanmax(turned_off(track, some)) < 0.2
     assert relative_error(track, omega) < 0.05
     counted = np.gradient(np.arange(len(rows))) / np.gradient(rows / RATE) * np.median(np.diff(rows / RATE))
-    assert np.abs(counted - 1).mean() > 0.2  # what frames counted as even would have done to omega
+    assert np.abs(counted - 1).mean() > 0.2  # omega if frames were counted as even
 
 
 @pytest.mark.slow

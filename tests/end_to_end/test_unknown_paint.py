@@ -1,4 +1,4 @@
-"""A map with a part that no picture showed: that part weighs nothing in a track, and the user is told of it."""
+"""A map with unseen paint: this part has no weight in a track, and a remark reports it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SHARE = 0.38  # of the rows, from the north pole: 32 % of the ball
 
 
 @pytest.mark.slow
-def test_unknown_paint_weighs_nothing_and_is_told(tmp_path):
+def test_unknown_paint_weighs_nothing_and_is_reported(tmp_path):
     """Before: 0.22 degrees, 18 of 30 frames valid and wrong without a mark, positions off by up to 1.2 mm."""
     movies = render(tmp_path / "whole", frames=16)
     path = write(movies, tmp_path / "part")
@@ -32,8 +32,8 @@ def test_unknown_paint_weighs_nothing_and_is_told(tmp_path):
     for error, covariance in zip(off, (track.position_cov, track.orientation_cov), strict=True):
         assert np.median(np.linalg.norm(in_sigmas(error, covariance), axis=1)) < 3
     assert all(why in ("ok", "unseen") for camera in track.cameras.values() for why in camera.reason)
-    (told,) = (line for line in track.provenance["remarks"] if "unseen" in line)
-    assert "32 % of the ball" in told
+    (remark,) = (line for line in track.provenance["remarks"] if "unseen" in line)
+    assert "32 % of the ball" in remark
 
     (found,) = (one for one in preflight(path).findings if one.title == "unseen paint")
     assert found.severity is Severity.WARNING

@@ -1,4 +1,4 @@
-"""An experiment of two small movies whose frames say their own number."""
+"""An experiment of two small movies whose frames hold their own number."""
 
 from __future__ import annotations
 

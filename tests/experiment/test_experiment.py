@@ -1,4 +1,4 @@
-"""experiment.yaml: what it says, what it refuses, and how movies, cameras and times come together."""
+"""experiment.yaml: its meaning, its refusals, and how movies, cameras and times come together."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_every_key_arrives_with_its_unit_and_paths_are_relative_to_the_file(fold
     assert experiment.flow == {"viscosity": 8e-6, "dissipation": 1.7}
 
 
-def test_what_is_left_out_has_its_default(folder):
+def test_omitted_keys_have_their_defaults(folder):
     experiment = load_experiment(str(written(folder, SHORT)))
     assert experiment.name == "experiment"
     assert experiment.diameter_mm is None
@@ -138,7 +138,7 @@ FAULTS = {
 }
 
 
-def test_what_live_sets_on_a_camera_is_read(folder):
+def test_settings_of_live_for_a_camera_are_read(folder):
     given = "{cam1: {trigger: Line1, exposure_ms: 0.4, rate_hz: 600, pixel_format: Mono12, offset: [8, 4]}}"
     (name, keys), *others = load_experiment(written(folder, SHORT + f"camera: {given}\n")).devices.items()
     assert not others
@@ -183,7 +183,7 @@ def test_the_shared_experiments_open(name, count):
     assert experiment.fixed == (name == "fixed_ball")
 
 
-def test_files_outside_of_the_experiments_folder_are_told(folder, tmp_path_factory):
+def test_files_outside_of_the_experiments_folder_are_reported(folder, tmp_path_factory):
     assert outside_paths(load_experiment(written(folder, FULL))) == []
     other = tmp_path_factory.mktemp("other") / "texture.png"
     (folder / "link.png").symlink_to(other)
@@ -247,7 +247,7 @@ def test_the_experiment_of_one_ball_is_that_of_a_file_with_only_this_ball(folder
         alone.of("b")
 
 
-def test_what_holds_for_one_ball_is_refused_for_several(folder):
+def test_keys_for_one_ball_are_refused_for_several(folder):
     experiment = load_experiment(written(folder, BALLS))
     for name in ("sphere", "diameter_mm", "texture_path", "fixed", "radius_mm"):
         with pytest.raises(ExperimentError, match="expected one ball"):

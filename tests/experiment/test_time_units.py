@@ -126,7 +126,7 @@ def test_a_table_of_another_length_than_the_movie_is_refused(tmp_path):
     assert any("for 6 frames" in remark for remark in open_movie(tmp_path / "m.h5").remarks)
 
 
-def test_stamps_of_players_are_no_times_and_the_refusal_says_what_to_write(tmp_path):
+def test_stamps_of_players_are_no_times_and_the_refusal_names_the_key(tmp_path):
     write_movie(tmp_path / "m.mkv", GREY, frame_rate_hz=40)
     with pytest.raises(MovieError, match="frame_rate: 40"):
         line(tmp_path, "times: movies", "m.mkv")

@@ -1,4 +1,4 @@
-"""Which frame is when, and which picture of each movie shows it."""
+"""Time of each frame, and the picture of each movie that shows it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def line(folder: Path, text: str) -> Timeline:
 
 
 def save_stamped(path: Path, time_s: list[float]) -> None:
-    """A movie whose frames say their own number, with stamps."""
+    """A movie whose frames hold their own number, with stamps."""
     with h5py.File(path, "w") as file:
         file["frames"] = np.arange(len(time_s), dtype=np.uint8)[:, None, None] * np.ones((1, 6, 8), np.uint8)
         file["time"] = np.asarray(time_s)
@@ -54,13 +54,13 @@ def test_time_is_frame_number_over_frame_rate_and_does_not_restart_with_frames(f
     assert time_s[0] != 5 / 600.0  # nor by the second movie's own frames
 
 
-def test_a_movie_that_ends_early_has_no_pictures_of_the_last_frames_and_a_remark_says_so(folder):
+def test_a_movie_that_ends_early_has_no_pictures_of_the_last_frames_and_a_remark(folder):
     frames = line(folder, BOTH)
     assert frames.rows["cam1"].tolist() == [*range(12), NONE, NONE, NONE]
     assert frames.rows["cam2"].tolist() == list(range(15))
     assert len(frames.remarks) == 1
     assert "cam1.npy: no pictures of frames 12 to 14" in frames.remarks[0]
-    assert not line(folder, BOTH + "frames: [0, 12]\n").remarks  # nothing asked for is lacking
+    assert not line(folder, BOTH + "frames: [0, 12]\n").remarks  # all requested frames exist
 
 
 def test_frames_beyond_all_movies_are_refused(folder):
@@ -103,8 +103,8 @@ def test_a_table_that_is_none_is_refused(folder, name):
     assert "\n" not in str(refused.value)
 
 
-def test_stamps_pair_the_cameras_whatever_either_lost(folder):
-    """cam1 lost picture 3, cam2 lost pictures 1 and 5, and is 0.2 ms late: stamps tell, counting would not."""
+def test_stamps_pair_the_cameras_whichever_pictures_either_lost(folder):
+    """cam1 lost picture 3, cam2 lost pictures 1 and 5, and is 0.2 ms late: stamps show it, counting would not."""
     grid = np.arange(8) * 0.01
     save_stamped(folder / "cam1.h5", np.delete(grid, 3).tolist())
     save_stamped(folder / "films" / "cam2.h5", (np.delete(grid, [1, 5]) + 0.0002).tolist())
@@ -129,14 +129,14 @@ def test_with_start_each_cameras_clock_begins_at_that_picture(folder):
     np.testing.assert_allclose(frames.time_s, 0.01 * np.arange(7), atol=1e-12)
 
 
-def test_cameras_that_are_late_on_each_other_are_told(folder):
+def test_cameras_that_are_late_on_each_other_are_reported(folder):
     grid = np.arange(8) * 0.01
     save_stamped(folder / "cam1.h5", grid.tolist())
     save_stamped(folder / "films" / "cam2.h5", (grid + 0.002).tolist())
     assert "differ by 0.002 s" in line(folder, STAMPED).remarks[0]
 
 
-def test_a_movie_without_stamps_is_refused_where_they_are_asked_for(folder):
+def test_a_movie_without_stamps_is_refused_where_the_experiment_uses_them(folder):
     with pytest.raises(MovieError, match="time stamps, got none"):
         line(folder, BOTH.replace("frame_rate: 30", "times: movies"))
 
@@ -173,7 +173,7 @@ def test_times_off_any_grid_are_refused_for_methods_that_need_one():
         Timeline(number=np.arange(5), time_s=time_s, rows={}).gridded()
 
 
-def test_stamps_of_three_cameras_make_one_frame_whatever_each_lost(folder):
+def test_stamps_of_three_cameras_make_one_frame_whichever_pictures_each_lost(folder):
     grid = np.arange(6) * 0.01
     save_stamped(folder / "cam1.h5", np.delete(grid, 1).tolist())
     save_stamped(folder / "films" / "cam2.h5", (np.delete(grid, [1, 3]) + 0.0002).tolist())

@@ -1,4 +1,4 @@
-"""What runs keep: the same arrays, or made again; never a wrong one, and no fault of the folder ends a run."""
+"""Kept arrays are the same or made again; never wrong; no fault of the folder ends a run."""
 
 from __future__ import annotations
 
@@ -91,11 +91,11 @@ def test_a_damaged_file_is_made_again_with_a_warning(folder: Path, damage: str) 
 def test_a_folder_that_cannot_be_written_is_warned_of_once(folder: Path) -> None:
     folder.write_text("a file")
     make = Maker()
-    with pytest.warns(UserWarning, match="nothing is kept") as told:
+    with pytest.warns(UserWarning, match="nothing is kept") as caught:
         found = [cached("kind", (), make) for _ in range(2)]
     assert_same(found[1])
     assert make.made == 2
-    assert len([one for one in told if "nothing is kept" in str(one.message)]) == 1
+    assert len([one for one in caught if "nothing is kept" in str(one.message)]) == 1
 
 
 def test_without_the_cache_nothing_is_read_or_written(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,7 +28,7 @@ def test_there_is_none_where_nothing_was_built_or_the_file_is_no_library(tmp_pat
     assert compiled(tmp_path / "other", Near) is None
 
 
-def test_code_that_does_not_load_is_told_with_its_file_and_absent_code_is_none(tmp_path):
+def test_code_that_does_not_load_is_reported_with_its_file_and_absent_code_is_none(tmp_path):
     source = tmp_path / "so3.c"
     source.write_bytes(SOURCE.parents[1].joinpath("so3.c").read_bytes())
     assert compiled_parts(tmp_path) == ({"so3": "torch: slower"}, [])
@@ -39,7 +39,7 @@ def test_code_that_does_not_load_is_told_with_its_file_and_absent_code_is_none(t
 
 
 @pytest.mark.skipif(compiled(SOURCE, Near) is None, reason="needs compiled code: `make setup` with a compiler")
-def test_code_in_use_is_told_by_its_instructions(monkeypatch):
+def test_code_in_use_is_named_by_its_instructions(monkeypatch):
     used, faults = compiled_parts()
     assert set(used) == {"so3", "texture_table", "refine", "paint_cells", "kalman"}
     assert set(used.values()) <= {"avx512", "avx2", "default"}

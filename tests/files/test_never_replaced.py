@@ -67,7 +67,7 @@ THEIRS = {
 def test_a_file_with_our_mark_is_replaced(tmp_path, name):
     path = tmp_path / name
     OURS[name](path)
-    os.utime(path, (1, 1))  # not as this process left it: the mark alone decides
+    os.utime(path, (1, 1))  # changed since this process wrote it: the mark alone decides
     assert has_mark(path)
     write_text(path, "new")
     assert path.read_text() == "new"

@@ -64,7 +64,7 @@ def sized_twice(kind: int, large: tuple[int, int], small: tuple[int, int]) -> by
 
 
 @pytest.mark.parametrize("kind", [4, 17])
-def test_of_sizes_given_twice_that_of_the_decoder_counts(kind, tmp_path):
+def test_where_a_size_stands_twice_the_decoders_counts(kind, tmp_path):
     """Before: 2048 pixels claimed, 10,000 decoded; 450 million passed the limit of 33.6 million and took 3.9 GB."""
     twice = sized_twice(kind, (100, 100), (64, 32))
     assert decoded_grey(twice).size == 10_000

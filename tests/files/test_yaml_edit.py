@@ -62,5 +62,5 @@ def test_a_value_is_put_in_and_all_else_stays(text, place, value, new):
         ("", ["b"]),
     ],
 )
-def test_what_could_be_lost_is_left_to_the_person(text, place):
+def test_an_edit_that_could_lose_text_is_not_made(text, place):
     assert with_value(text, place, {"c": 1}) is None

@@ -36,10 +36,10 @@ def test_the_line_and_the_likely_slip_are_named(tmp_path: Path, text: str, slip:
     path.write_text(HEAD + text)
     with pytest.raises(ExperimentError) as refused:
         read_yaml(path, ExperimentError)
-    said = str(refused.value)
-    assert "\n" not in said
-    assert slip in said
-    assert f"line {line}" in said
+    message = str(refused.value)
+    assert "\n" not in message
+    assert slip in message
+    assert f"line {line}" in message
 
 
 def test_right_files_are_read_and_other_faults_keep_their_words(tmp_path: Path):

@@ -1,4 +1,4 @@
-"""What is learnt of the cameras' agreement before frames are followed."""
+"""The usual disagreement of the cameras, learnt before tracking."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_a_camera_is_explained_by_its_own_proven_frames_where_another_camera_sho
 
 
 @pytest.mark.slow
-def test_a_small_ball_is_measured_by_both_cameras_though_each_alone_knows_its_rotation_badly(tmp_path):
+def test_a_small_ball_is_measured_by_both_cameras_though_each_alone_gives_its_rotation_badly(tmp_path):
     movement = {"volume_mm": 14.0, "velocity_rms": 0.12}
     settings = SynthSettings(frames=30, seed=1, diameter_px=16.0, image_size=(120, 120), **movement)
     experiment = write_synthetic_experiment(tmp_path, settings)

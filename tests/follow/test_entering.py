@@ -1,4 +1,4 @@
-"""A ball that comes into view, and one that comes nearer than it was in the frames that were studied."""
+"""A ball that comes into view, and one that comes nearer than in the frames of the appearance."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SETTINGS = load_settings(None, [*SHORT[1:], "refine.chunk_frames=16"])
 
 @pytest.fixture(scope="module")
 def known(tmp_path_factory):
-    """The track of the excerpt, and the file of what was learnt."""
+    """The track of the excerpt, and the file of its appearance."""
     path = tmp_path_factory.mktemp("known") / "learnt.h5"
     return run(Request(experiment=EXCERPT, settings=SETTINGS, save_learnt=path), MemoryStore()), path
 
@@ -42,11 +42,11 @@ def test_frames_before_the_first_one_that_a_search_finds_are_followed_back(known
     searches = []
     found = BallTracker.searched
 
-    def searched(self, shots):
-        searches.append(shots)
+    def searched(self, frames):
+        searches.append(frames)
         # Nothing is found in the first frames of the chunks, which go side by side.
-        here = found(self, shots)
-        return no_pose(len(shots), [Reason.NOT_FOUND] * len(shots)) if len(searches) < 8 else here
+        here = found(self, frames)
+        return no_pose(len(frames), [Reason.NOT_FOUND] * len(frames)) if len(searches) < 8 else here
 
     monkeypatch.setattr(BallTracker, "searched", searched)
     track = run(Request(experiment=EXCERPT, settings=SETTINGS, learnt=path), MemoryStore())

@@ -1,4 +1,4 @@
-"""A ball that turns in its place: one place for all frames, found from a few, held in all, its error not forgotten."""
+"""A fixed ball: one position for all frames, found from a few, held in all, with its error."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ def scattered(trials: int, count: int, seed: int = 4) -> tuple[Tensor, Tensor]:
     return (root @ errors)[..., 0], root @ root.mT
 
 
-def test_the_mean_place_errs_as_its_covariance_says():
+def test_the_mean_position_errs_as_its_covariance_states():
     X, covariance = scattered(trials=400, count=12)
     found = [mean_place(one, covariance) for one in X]
     away = torch.stack([place @ torch.linalg.solve(C, place) for place, C in found])
     assert float(away.mean()) == pytest.approx(3.0, rel=0.25), "chi squared of three coordinates"
 
 
-def test_frames_that_are_far_off_hardly_move_the_mean_place():
+def test_frames_that_are_far_off_hardly_move_the_mean_position():
     X, covariance = scattered(trials=1, count=12)
     good, _ = mean_place(X[0], covariance)
     spoilt = X[0].clone()
@@ -61,24 +61,24 @@ def test_frames_that_are_far_off_hardly_move_the_mean_place():
     )
     sigma = C.diagonal().sqrt()
     assert ((place - good).abs() < 2 * sigma).all()
-    assert ((plain - good).abs() > 4 * sigma).any(), "a mean that believes all is carried away"
+    assert ((plain - good).abs() > 4 * sigma).any(), "a plain mean is far off"
 
 
-def test_measurements_that_scatter_by_more_than_they_say_tell_less():
+def test_measurements_that_scatter_by_more_than_they_state_weigh_less():
     X, covariance = scattered(trials=1, count=12)
-    _, said = mean_place(X[0], covariance)
+    _, stated = mean_place(X[0], covariance)
     _, wider = mean_place(5 * X[0], covariance)
-    assert float(wider.diagonal().sum() / said.diagonal().sum()) > 5
+    assert float(wider.diagonal().sum() / stated.diagonal().sum()) > 5
 
 
-def test_a_single_frame_tells_the_place_as_well_as_it_can():
+def test_a_single_frame_gives_the_position_with_its_own_error():
     X, covariance = scattered(trials=1, count=1)
     place, C = mean_place(X[0], covariance)
     assert_close(place, X[0, 0], 1e-9)
     assert_close(C, covariance[0], 1e-9)
 
 
-def test_attitudes_err_with_the_place_as_follows_says():
+def test_attitudes_err_with_the_position_as_follows_states():
     rig, (X, R) = rig_of(40.0, ("pinhole",)), balls(4, 1, reach_mm=0.0)
     pixels, use = cut(rig, pictures_of(rig, "patches", X, R), X), torch.ones(4, 1, dtype=torch.bool)
 
@@ -94,14 +94,14 @@ def test_attitudes_err_with_the_place_as_follows_says():
     follows = follows_place(Held(), pixels, X[0], R, use)
     firm = 1e14 * torch.eye(3, dtype=torch.float64).expand(4, 3, 3)
     for aside in f64([[0.05, 0.0, 0.0], [0.0, 0.0, 0.05]]):
-        # Held at the true place + aside, the place errs by -aside: true less measured, as delta is of the attitude.
+        # Held at the true position + aside, the error of the position is -aside: true less measured, as for delta.
         error = turn_errors(held(X + aside, R, firm), R) - turn_errors(held(X, R, firm), R)
         assert_close(error.median(0).values, -follows @ aside, 0.1 * float((follows @ aside).norm()))
 
 
 @cache
 def in_its_place(folder: Path) -> Path:
-    """A ball that turns in one place before two cameras."""
+    """A fixed ball before two cameras."""
     settings = SynthSettings(
         frames=40, image_size=(150, 150), diameter_px=56.0, volume_mm=8.0, velocity_rms=0.0, exposure=1e-4,
         exposure_samples=1, omega_rms=40.0, seed=5,
@@ -115,10 +115,10 @@ def truth(path: Path) -> tuple[Tensor, Tensor]:
         return torch.from_numpy(file["position"][()]), torch.from_numpy(file["orientation"][()])
 
 
-def beside(fitter: Fitter, shots: Sequence[Frame], pose: Poses, place: FixedCentre, error_mm: Tensor) -> Tensor:
-    """Delta by which a frame's attitude is found to differ where the ball is held beside its place; brute force."""
+def beside(fitter: Fitter, frames: Sequence[Frame], pose: Poses, place: FixedCentre, error_mm: Tensor) -> Tensor:
+    """Delta of a frame's attitude where the ball is held beside its position; brute force."""
     fine, use = fitter.optics.fine, pose.use[None]
-    pixels = fitter.pixels([[shot.picture for shot in shots]], place.position_lab_mm[None], fine)
+    pixels = fitter.pixels([[frame.picture for frame in frames]], place.position_lab_mm[None], fine)
     firm = 1e14 * torch.eye(3, dtype=torch.float64)[None]
     R = [
         fitter.fit(pixels, PoseStart(X[None], pose.R_lab_body[:1], use, firm), fine, 6).R_lab_body
@@ -130,7 +130,7 @@ def beside(fitter: Fitter, shots: Sequence[Frame], pose: Poses, place: FixedCent
 def followed_poses(
     path: Path, cameras: list[str] | None
 ) -> tuple[FixedCentre, list[Poses], list[Poses], Tensor, Tensor]:
-    """The place that a few frames tell, all frames' poses with each its own place, and held in that one.
+    """Position from a few frames; poses of all frames with a position each; poses at that one position.
 
     And two errors of the place, (2, 3), mm, with the turns that they do to some frames, (frames, 2, 3).
     """
@@ -139,8 +139,8 @@ def followed_poses(
         begun = learn(Job(recording=recording, settings=settings, device=torch.device("cpu")), silent)
         known, search = begun.appearance, begun.tracker.balls[""].search
         views = known.fitter.views
-        shots, _ = sample_frames(recording, views, settings.refine.appearance_frames)
-        place = find_fixed_centre(search, shots, known.score_min)
+        frames, _ = sample_frames(recording, views, settings.refine.appearance_frames)
+        place = find_fixed_centre(search, frames, known.score_min)
         assert place is not None
         movies = [
             list(screened_frames(stream, view.background))
@@ -179,7 +179,7 @@ def test_all_frames_are_measured_in_one_place_and_better(tmp_path_factory, camer
     sigma = place.covariance_mm2.diagonal().sqrt()
     assert ((at - place.position_lab_mm).abs() < 0.1 * sigma).all(), "one place"
     off = place.position_lab_mm - X[0]
-    assert float(off @ torch.linalg.solve(place.covariance_mm2, off)) < 16, "where it is, as its error says"
+    assert float(off @ torch.linalg.solve(place.covariance_mm2, off)) < 16, "within its stated error"
     errors = [so3.log(R @ torch.stack([poses.R_lab_body[0] for poses in some]).mT) for some in (free, held)]
     steps = [torch.diff(error, dim=0).norm(dim=1).median() for error in errors]
     assert float(errors[1].norm(dim=1).median()) < 0.92 * float(errors[0].norm(dim=1).median())
@@ -188,11 +188,11 @@ def test_all_frames_are_measured_in_one_place_and_better(tmp_path_factory, camer
     assert float((turns.mean(0) - expected).norm()) < 0.12 * float(expected.norm())
     covariance = torch.stack([poses.covariance[0, :3, :3] for poses in held])
     away = (errors[1][:, None] @ torch.linalg.solve(covariance, errors[1][..., None]))[:, 0, 0]
-    assert 0.3 < float(away.mean()) / 3 < 4, "and the attitudes' errors are as their covariances say"
+    assert 0.3 < float(away.mean()) / 3 < 4, "the attitudes' errors are as stated"
 
 
 def declared(folder: Path) -> tuple[Path, Path]:
-    """The same movie, as one of a ball that moves, and declared to be of one that does not."""
+    """Tracks of the same movie: of a moving ball, and declared fixed."""
     path = in_its_place(folder)
     document = yaml.safe_load(path.read_text())
     document["sphere"]["fixed"] = True
@@ -212,7 +212,7 @@ def test_a_ball_declared_fixed_has_one_place_in_its_track(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_what_another_run_learnt_measures_in_the_same_place_to_the_last_bit(tmp_path_factory, tmp_path):
+def test_the_appearance_of_another_run_measures_at_the_same_position_to_the_last_bit(tmp_path_factory, tmp_path):
     _, fixed = declared(tmp_path_factory.getbasetemp() / "in_its_place")
     known = tmp_path / "learnt.h5"
     first = run(Request(experiment=fixed, cameras=("cam1",), save_learnt=known), MemoryStore())

@@ -13,7 +13,7 @@ from sphereorient.pose.poses import FittedPoses, blank_parts
 
 
 def likelihood(nll: list[float], *score: list[float]) -> torch.Tensor:
-    """Of poses with the scores of each camera."""
+    """Likelihood of poses with the scores of each camera."""
     parts = blank_parts(len(score), len(nll)) | {"nll": torch.tensor(nll), "score": torch.tensor(score).T}
     return explaining_first(FittedPoses(**parts), torch.ones(len(score), dtype=torch.bool))
 
@@ -37,7 +37,7 @@ def test_a_pose_that_is_less_likely_anyway_keeps_its_likelihood():
 
 
 def test_a_disk_of_unknown_paint_does_not_count():
-    # the second camera sees nothing known of the right pose, and of a wrong one what might be anything
+    # the second camera sees only unseen paint of the right pose, and any paint of a wrong one
     assert order([100.0, 200.0], [0.99, 0.6], [0.0, 0.6]) == [0, 1]
     assert order([100.0, 200.0], [0.0, 0.6], [0.0, 0.6]) == [1, 0]
 

@@ -1,4 +1,4 @@
-"""The response of a camera is learnt where the pictures tell it, told, and kept with what was learnt."""
+"""The response of a camera is learnt where the pictures show it, reported, and kept with the appearance."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def coded_grey(light):
     return (255.0 * (light / 255.0) ** (1 / GAMMA)).round().astype(np.uint8)
 
 
-def test_white_that_is_cut_off_tells_no_response(monkeypatch):
+def test_white_that_is_cut_off_gives_no_response(monkeypatch):
     clipped = torch.zeros(4, 100, dtype=torch.bool)
     clipped[1::2, :10] = True  # a tenth of the disks of the second camera
     pixels = SimpleNamespace(clipped=clipped, inside=torch.ones_like(clipped))
@@ -45,7 +45,7 @@ def test_white_that_is_cut_off_tells_no_response(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_coded_camera_beside_a_linear_one_is_learnt_told_and_kept(tmp_path):
+def test_a_coded_camera_beside_a_linear_one_is_learnt_reported_and_kept(tmp_path):
     linear = write_synthetic_experiment(tmp_path, SynthSettings(frames=48, seed=5))
     as_filmed = run(Request(experiment=linear), MemoryStore())
     document = yaml.safe_load(linear.read_text())

@@ -70,7 +70,7 @@ def test_odds_against_the_mirror_image_are_those_of_the_mirror_image_against_the
     assert float(odds(0.7, 0.4).log_odds) == pytest.approx(-float(odds(0.4, 0.7).log_odds))
 
 
-def test_pictures_add_their_odds_and_one_without_a_disk_says_nothing():
+def test_pictures_add_their_odds_and_one_without_a_disk_adds_none():
     both = MapOdds(score=torch.tensor([[0.7], [0.6], [torch.nan]]), mirrored=torch.tensor([[0.4], [0.5], [torch.nan]]))
     assert float(both.log_odds) == pytest.approx(float(odds(0.7, 0.4).log_odds + odds(0.6, 0.5).log_odds))
 
@@ -131,7 +131,7 @@ def test_a_map_of_another_ball_is_refused(still):
 
 
 def chosen_alone(odds_of_map, *others):
-    """What becomes of a frame alone with one pose of score 0.9, and others of these scores."""
+    """Outcome of a single frame with one pose of score 0.9, and others of these scores."""
     table = PoseTable(
         mask=torch.ones(1, 1 + len(others)).bool(),
         use=torch.ones(1, 1).bool(),

@@ -44,7 +44,7 @@ def test_motion_while_the_shutter_is_open_is_no_blur(tmp_path):
 
 @pytest.mark.slow
 def test_an_exposure_that_is_not_that_of_the_pictures_smears_nothing(tmp_path):
-    """Sharp pictures of a ball that would turn by 20 degrees in the exposure of the file."""
+    """Sharp pictures of a ball that would rotate by 20 degrees in the exposure of the file."""
     settings = SynthSettings(frames=24, omega_rms=480.0, omega_time=1.0, exposure=0.0004, exposure_samples=1)
     experiment, known = write_synthetic_experiment(tmp_path, settings), tmp_path / "learnt.h5"
     track = run(Request(experiment=experiment, save_learnt=known), MemoryStore())

@@ -1,4 +1,4 @@
-"""The start of a frame of several balls: who is where, by paint, sights, size and motion."""
+"""The start of a frame of several balls: names by paint, lines of sight, size and motion."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def rotation(*rotvec):
 
 
 class Planted:
-    """A ball whose paint is known exactly: disks show the rotations of the planted balls that wear it."""
+    """A ball whose paint is known exactly: disks show the rotations of the planted balls that have it."""
 
     def __init__(self, paint, truth, worse=()):
         self.paint, self.truth, self.worse = paint, truth, worse
@@ -55,7 +55,7 @@ class Planted:
             rows.append((torch.stack([astray, other] if paint == self.paint else [other, astray.mT]), score))
         return rows
 
-    def fitted(self, shots, found, R):
+    def fitted(self, frames, found, R):
         use = torch.tensor([one is not None for one, _ in found])
         match = Match(chosen=(), disks=tuple(one for one, _ in found), chi2=0.0)
         parts = blank_parts(len(CAMERAS), 1)
@@ -65,7 +65,7 @@ class Planted:
         return Poses(**parts | {"R_lab_body": R[:1]}, use=use, reason=tuple(why for _, why in found))
 
 
-def shots_of(truth):
+def frames_of(truth):
     found = []
     for camera in CAMERAS.values():
         picture = np.full(SHAPE, 15, np.uint8)
@@ -96,7 +96,7 @@ def ahead(X, R, sigma_mm=1.0):
 
 
 def test_each_ball_is_found_by_its_paint_with_pictures_of_both_cameras():
-    found = start_of()(shots_of(TRUTH), ["a", "b", "c"], {})
+    found = start_of()(frames_of(TRUTH), ["a", "b", "c"], {})
     assert_close(found["b"].position_lab_mm[0], B, 0.5)
     assert so3.geodesic_distance(found["b"].R_lab_body[0], TRUTH[1][1]) < 0.1
     assert all(poses.use.all() for poses in found.values())
@@ -108,41 +108,41 @@ def test_each_ball_is_found_by_its_paint_with_pictures_of_both_cameras():
 def test_balls_painted_alike_get_their_names_from_the_past(exchanged):
     first, second = (TRUTH[2], TRUTH[0]) if exchanged else (TRUTH[0], TRUTH[2])
     past = {"a": ahead(first[0] + 2.0, first[1], 3.0), "c": ahead(second[0] - 2.0, second[1], 3.0)}
-    found = start_of()(shots_of(TRUTH), ["a", "b", "c"], {}, past)
+    found = start_of()(frames_of(TRUTH), ["a", "b", "c"], {}, past)
     assert_close(found["a"].position_lab_mm[0], first[0], 0.5)
     assert_close(found["c"].position_lab_mm[0], second[0], 0.5)
 
 
 def test_a_ball_at_a_known_place_leaves_its_disks_to_no_other():
-    found = start_of()(shots_of(TRUTH), ["c"], {"a": C, "b": B})
+    found = start_of()(frames_of(TRUTH), ["c"], {"a": C, "b": B})
     assert list(found) == ["c"]
     assert_close(found["c"].position_lab_mm[0], A, 0.5)
 
 
 def test_a_ball_that_is_not_in_view_has_no_pose_and_a_reason():
     here = [TRUTH[0], TRUTH[2]]
-    found = start_of(here)(shots_of(here), ["a", "b", "c"], {})
+    found = start_of(here)(frames_of(here), ["a", "b", "c"], {})
     assert len(found["b"]) == 0
     assert found["b"].reason == (Reason.NOT_FOUND, Reason.NOT_FOUND)
     assert len(found["a"]) == len(found["c"]) == 1
 
 
 def test_a_picture_that_cannot_be_used_leaves_the_ball_to_the_other_camera():
-    shots = shots_of(TRUTH)
-    shots[1] = replace(shots[1], read=Reason.MISSING)
-    found = start_of()(shots, ["a", "b", "c"], {})
+    frames = frames_of(TRUTH)
+    frames[1] = replace(frames[1], read=Reason.MISSING)
+    found = start_of()(frames, ["a", "b", "c"], {})
     assert found["b"].use.tolist() == [True, False]
     assert found["b"].reason == (Reason.OK, Reason.MISSING)
 
 
-def test_a_place_whose_fit_does_not_explain_the_pictures_is_given_to_another_paint_or_to_nobody():
-    found = start_of(paint0=(2,))(shots_of(TRUTH), ["a", "b", "c"], {})
+def test_a_position_whose_fit_does_not_explain_the_pictures_goes_to_another_paint_or_to_no_ball():
+    found = start_of(paint0=(2,))(frames_of(TRUTH), ["a", "b", "c"], {})
     assert sorted(len(found[name]) for name in "ac") == [0, 1]
     assert len(found["b"]) == 1
 
 
 def test_pictures_of_nothing_have_no_balls():
-    found = start_of()(shots_of([]), ["a", "b"], {})
+    found = start_of()(frames_of([]), ["a", "b"], {})
     assert [len(poses) for poses in found.values()] == [0, 0]
 
 

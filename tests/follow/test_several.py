@@ -115,8 +115,8 @@ def followed_where(movie, again, exchanged=False):
         job = Job(recording=recording, settings=load_settings(None, (CHUNK,)), device=torch.device("cpu"))
         follower = precise.resume(job, learnt)
         scene, views = follower.tracker, next(iter(follower.appearances.values())).fitter.views
-        shots = [list(screened_frames(s, v.background, 0, 20)) for s, v in zip(recording.streams, views, strict=True)]
-        number = {id(shot): k for k, shot in enumerate(shots[0])}
+        frames = [list(screened_frames(s, v.background, 0, 20)) for s, v in zip(recording.streams, views, strict=True)]
+        number = {id(frame): k for k, frame in enumerate(frames[0])}
 
         def start(frame, names, known, past):
             if 0 < number[id(frame[0])] < again:
@@ -127,7 +127,7 @@ def followed_where(movie, again, exchanged=False):
         balls = {name: tracker if name == "b" else Astray(tracker, 8) for name, tracker in scene.balls.items()}
         tracker = Tracker(balls)
         tracker.start = start
-        return list(tracker.track(shots, [20], recording.clock.tolist()))
+        return list(tracker.track(frames, [20], recording.clock.tolist()))
 
 
 def names_of(found, movie):

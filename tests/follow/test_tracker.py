@@ -1,4 +1,4 @@
-"""What the frames before say of the next one, and when two cameras disagree."""
+"""Prediction of the next frame from earlier ones, and disagreement of two cameras."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ def lane(frames: list[int], change: float, times: list[float] = TIMES) -> Chunk:
 
 
 @pytest.mark.parametrize(("frames", "change"), [([1, 2], 0.0), ([0, 1, 2], 0.0), ([0, 1, 2], 0.02)], ids=str)
-def test_the_next_pose_continues_the_motion_whatever_the_times(frames, change):
+def test_the_next_pose_continues_the_motion_at_any_times(frames, change):
     expected = lane(frames, change).expected(3, RADIUS_MM)
     assert not expected.rough
     assert_close(f64(expected.position_lab_mm), place(3.2, change), 1e-9)
     assert_close(so3.exp(f64(expected.turn)) @ f64(expected.R_before), so3.exp(angle(3.2, change) * AXIS), 1e-6)
 
 
-def test_of_a_change_of_the_turn_within_the_scatter_of_poses_half_goes_on():
+def test_half_of_a_change_of_rotation_within_the_scatter_of_poses_goes_on():
     exact, times = lane([0, 1, 2], 0.02, [0.0, 1.0, 2.0, 3.0]), [0.0, 1.0, 2.0, 3.0]
     scattered = Chunk(0, times, past=exact.past.copy(), turns=exact.turns.copy())
     for k, (number, poses) in enumerate(exact.past):
@@ -116,10 +116,10 @@ def test_after_a_pause_the_rate_goes_on_roughly():
 def test_a_late_time_stamp_does_not_bend_the_motion(late):
     stamps = [0.0, 1.0, 2.0, 3.0]
     stamps[late] = late + 0.99
-    told_late = Chunk(0, stamps)
+    appended_late = Chunk(0, stamps)
     for frame in range(3):
-        told_late.saw(frame, seen(frame, 0.0), 0.04 * AXIS.numpy())
-    expected = told_late.expected(3, RADIUS_MM)
+        appended_late.saw(frame, seen(frame, 0.0), 0.04 * AXIS.numpy())
+    expected = appended_late.expected(3, RADIUS_MM)
     assert not expected.rough
     assert_close(f64(expected.turn), 0.04 * AXIS, 1e-9)
     assert_close(f64(expected.position_lab_mm), place(3.0, 0.0), 1e-9)
@@ -154,22 +154,22 @@ def test_cameras_disagree_where_their_own_turns_are_apart_by_more_than_usual_and
     x = f64([1.0, 0.0, 0.0])
 
     def disagree(first: float, second: float, sigma: float = 1e-3, both: bool = True) -> bool:
-        said = SimpleNamespace(
+        fit = SimpleNamespace(
             own_turn=torch.stack([first * x, second * x])[None],
             own_covariance=(sigma**2 * torch.eye(3, dtype=torch.float64)).expand(1, 2, 3, 3),
         )
         tracker = SimpleNamespace(usual_apart_rad=0.002)
-        return bool(BallTracker.contradictory(tracker, said, torch.tensor([[True, both]])))
+        return bool(BallTracker.contradictory(tracker, fit, torch.tensor([[True, both]])))
 
     assert disagree(0.006, -0.006)
-    assert not disagree(0.006, 0.006), "both would turn the pose alike"
+    assert not disagree(0.006, 0.006), "both would rotate the pose alike"
     assert not disagree(0.003, -0.003), "four times the usual angle are 0.008"
     assert not disagree(0.006, -0.006, sigma=0.005), "no more than their errors"
     assert not disagree(0.006, -0.006, both=False), "one camera"
 
 
 def part(turn: float, cameras: int) -> Poses:
-    """What some cameras say of a ball, that is turned about x from where others see it."""
+    """Poses by some cameras, rotated about x from those of others."""
     whole = seen(0.0, 0.0)
     names = ("own_turn", "own_covariance", "own_move", "own_sigma_mm", "limb_coverage", "excess", "score")
     return replace(

@@ -1,4 +1,4 @@
-"""Paint that has come off the ball is found in its movie, not used, told, and kept with what was learnt."""
+"""Paint that has come off the ball is found in its movie, left out, reported, and kept with the appearance."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def worn(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_worn_paint_is_not_used_told_and_kept(worn, tmp_path, monkeypatch):
+def test_worn_paint_is_not_used_but_reported_and_kept(worn, tmp_path, monkeypatch):
     known = tmp_path / "learnt.h5"
     track = run(Request(experiment=worn, save_learnt=known), MemoryStore())
     monkeypatch.setattr(sys, "argv", f"sphereorient track {worn} -o {tmp_path}/asis.h5 -q --no-learn-paint".split())
@@ -36,8 +36,8 @@ def test_worn_paint_is_not_used_told_and_kept(worn, tmp_path, monkeypatch):
     off, before = off_deg(track, worn), off_deg(asis, worn)
     assert np.median(off) < 0.031 < 2 * 0.031 < np.median(before)
     assert rms_sigmas(track, off) < 1.5
-    told = [line for line in track.provenance["remarks"] if "differs from the texture map" in line]
-    assert len(told) == 1
+    remarks = [line for line in track.provenance["remarks"] if "differs from the texture map" in line]
+    assert len(remarks) == 1
     assert not any("differs" in line for line in asis.provenance["remarks"])
     cells = load_learnt(known)[""].worn
     assert 0.04 < worn_share(cells) < 0.2  # not all of it was in sight

@@ -41,21 +41,21 @@ def chunk(kind: bytes, content: bytes) -> bytes:
 
 
 def png(width: int, height: int, rows: bytes = b"", depth: int = 8, colour: int = 0, more: bytes = b"") -> bytes:
-    """A PNG file by hand, whatever it claims."""
+    """A PNG file by hand, with any claim in its header."""
     head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0))
     return b"\x89PNG\r\n\x1a\n" + head + more + chunk(b"IDAT", rows or zlib.compress(b"")) + chunk(b"IEND", b"")
 
 
 @functools.cache
 def bomb_png(width: int, height: int) -> bytes:
-    """A PNG whose zeros are all there: a thousand times smaller than what it unfolds to."""
+    """A PNG whose zeros are all there: a thousand times smaller than its pixels."""
     packer = zlib.compressobj(1)
     row = bytes(width + 1)
     return png(width, height, b"".join(packer.compress(row) for _ in range(height)) + packer.flush())
 
 
 def tiff(width: int, height: int, big: bool = False, entries: int = 0) -> bytes:
-    """The header of a TIFF file, whatever it claims."""
+    """The header of a TIFF file, with any claim."""
     order = ">" if big else "<"
     tags = [(256, 4, 1, width), (257, 4, 1, height), (258, 3, 1, 8), (259, 3, 1, 1), (262, 3, 1, 1), (273, 4, 1, 200)]
     tags += [(277, 3, 1, 1), (278, 4, 1, height), (279, 4, 1, 2**32 - 1)]
@@ -352,7 +352,7 @@ def timed_hdf5(folder: Path, frames: Frames) -> Path:
 
 
 def watch(path: Path) -> None:
-    """Open a movie, and read from its beginning and its end: what is not decodable must be told frame by frame."""
+    """Open a movie, read from its beginning and its end: each undecodable frame must be refused by itself."""
     with open_movie(path) as movie:
         count = len(movie)
         assert count > 0
@@ -390,7 +390,7 @@ FORMATS: dict[str, dict[str, Writer]] = {
 
 @functools.cache
 def movie_bytes(kind: str) -> list[bytes]:
-    """Valid movies of one kind, the first with one byte a pixel; of those without predicted frames also with two."""
+    """Valid movies of one kind, the first with one byte a pixel; kinds without predicted frames also with two."""
     with tempfile.TemporaryDirectory() as name:
         found = []
         for number, (form, write) in enumerate(FORMATS[kind].items()):

@@ -1,4 +1,4 @@
-"""What an answer to a hostile input is, and what is none: the one place that decides."""
+"""Judgement of the answers to hostile inputs."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ PATIENCE_S = 8  # a load that takes longer hangs
 LONGEST = 500  # characters of a message, without the folder of the test
 MEMORY_MB = 300  # by which a load may raise the peak of the process
 SPARSE_BYTES = 1_000_000_000
-ROOM_MB = 2000  # of address space beyond what the process has: what allocates more fails at once
+ROOM_MB = 2000  # of address space beyond that of the process: a larger allocation fails at once
 
 Load = Callable[[Path], Any]
 
 
 @dataclass(frozen=True)
 class Case:
-    """One hostile input: what it is called, what lies in the file, and what stands in the file's place."""
+    """One hostile input: its name, the content of its file, and what replaces the file."""
 
     name: str
     content: bytes = b""
@@ -59,7 +59,7 @@ class Case:
 
 
 LINKS = {"device": "/dev/zero", "loop": ""}
-# Bytes of a file with zeros behind what it begins with, none of them on the disk. Padded: a recording whose file was
+# Bytes of a file with zeros after its content, none of them on the disk. Padded: a recording whose file was
 # made large beforehand, which video libraries search for a next frame.
 BEHIND: dict[str, Callable[[int], int]] = {
     "file": lambda size: size,
@@ -71,7 +71,7 @@ PLACES = ("missing", "folder", "fifo", "device", "socket", "loop", "long name", 
 
 @dataclass
 class Tally:
-    """What became of the inputs of one family."""
+    """Results of one family."""
 
     refused: int = 0
     accepted: int = 0
@@ -81,7 +81,7 @@ class Tally:
     slowest: str = ""
 
     def judge(self, case: Case, load: Load, path: Path) -> None:
-        """Load one input, unless the same was loaded before, and note what came of it."""
+        """Load one input, unless the same was loaded before, and note the result."""
         if (case.place, case.content) in self.seen:
             return
         self.seen.add((case.place, case.content))
@@ -91,7 +91,7 @@ class Tally:
         grown, took = _peak_mb() - peak, time.perf_counter() - begun
         if took > self.slowest_s:
             self.slowest_s, self.slowest = took, case.name
-        if took > PATIENCE_S and "Hang" not in fault:  # signals wait where a library does not come back
+        if took > PATIENCE_S and "Hang" not in fault:  # signals wait where a library does not return
             fault = f"{fault}; took {took:.0f} s"
         if grown > MEMORY_MB:
             fault = f"{fault}; took {grown:.0f} MB"
@@ -106,7 +106,7 @@ class Tally:
         except SphereOrientError as error:
             self.refused += 1
             return _wrong_with(str(error), path)
-        except BaseException as error:  # whatever else comes out is the finding
+        except BaseException as error:  # any other error is a finding
             if isinstance(error, KeyboardInterrupt):
                 raise
             return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
@@ -117,7 +117,7 @@ class Tally:
 def _wrong_with(message: str, path: Path) -> str:
     if len(message.splitlines()) != 1 or any(unicodedata.category(letter) in ("Cc", "Cs") for letter in message):
         return f"not one line without controls: {message[:200]!r}"
-    # Where the hostile file names another one, by an absolute path, the fault may lie there.
+    # Where the hostile file names another one by an absolute path, the fault may be there.
     if path.name not in message and str(path.parent) not in message and not message.startswith("/"):
         return f"does not name the file: {message[:200]}"
     if len(message.replace(str(path.parent), "")) > LONGEST + (len(path.name) if len(path.name) > 255 else 0):
@@ -126,7 +126,7 @@ def _wrong_with(message: str, path: Path) -> str:
 
 
 class Hang(Exception):
-    """The load took longer than anybody waits."""
+    """The load took too long."""
 
 
 @contextmanager
@@ -149,7 +149,7 @@ def _peak_mb() -> float:
 
 @contextmanager
 def little_memory() -> Iterator[None]:
-    """Let the process have no more than ROOM_MB of address space beyond what it has."""
+    """Limit the process to ROOM_MB of address space beyond its present one."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * resource.getpagesize() + ROOM_MB * 2**20

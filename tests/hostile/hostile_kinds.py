@@ -1,4 +1,4 @@
-"""How inputs are spoilt: places where no file is, bytes, texts, and YAML documents."""
+"""Spoilt inputs: paths without a file, bytes, texts, and YAML documents."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def spoilt_bytes(draw: DrawFn, valid: Sequence[bytes]) -> Case:
         content[at:at] = content[at : at + draw(st.integers(1, 500))] * draw(st.sampled_from([1, 2, 50]))
     elif how == "insert":
         content[at:at] = draw(st.binary(min_size=1, max_size=40))
-    else:  # where headers are, numbers of four bytes with all that programs stumble over
+    else:  # in headers, extreme numbers of four bytes
         at = draw(st.integers(0, min(len(content), 200) // 4)) * 4
         number = draw(st.sampled_from([0, 1, 2, 255, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 10**9]))
         content[at : at + 4] = number.to_bytes(4, draw(st.sampled_from(["little", "big"])))
@@ -76,7 +76,7 @@ def spoilt_bytes(draw: DrawFn, valid: Sequence[bytes]) -> Case:
 
 
 def garbage() -> SearchStrategy[Case]:
-    """Bytes without any sense."""
+    """Random bytes."""
     return st.binary(max_size=300).map(lambda content: Case("garbage", content))
 
 
@@ -172,7 +172,7 @@ def with_value(document: dict[str, Any], place: tuple[Any, ...], value: str) -> 
 
 
 def all_values(document: dict[str, Any]) -> list[tuple[tuple[Any, ...], str]]:
-    """Every place of a document with every value; far more than anybody runs."""
+    """Every place of a document with every value; far too many to run."""
     return [(place, value) for place in _places(document) for value in VALUES]
 
 

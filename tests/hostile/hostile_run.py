@@ -1,4 +1,4 @@
-"""Judge all families with little memory and print what came of them: `python tests/hostile/hostile_run.py EXAMPLES`."""
+"""Judge all families with little memory and print the results: `python tests/hostile/hostile_run.py EXAMPLES`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import tempfile
 import warnings
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent))  # what pytest does for tests
+sys.path.insert(0, str(Path(__file__).parent))  # as pytest does for tests
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from hostile_files import file_families

@@ -40,7 +40,7 @@ class Family:
     load: Load
     cases: Callable[[Path], list[Case]]
     more: Callable[[Path], Generated]
-    beside: Callable[[Path], None] = lambda folder: None  # writes what lies beside the file
+    beside: Callable[[Path], None] = lambda folder: None  # writes the files beside it
     many: int = 1  # times as many generated ones as usual
 
     def run(self, folder: Path, tally: Tally, examples: int, written_out: bool = True) -> Tally:

@@ -1,4 +1,4 @@
-"""What hostile inputs once broke, one test a finding: each of these hung, crashed, filled the memory or lied."""
+"""Faults that hostile inputs once found, a test each: hangs, crashes, filled memory, wrong results."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_name_that_no_file_can_have_is_refused(tmp_path):
         *(pytest.param(many, marks=pytest.mark.slow) for many in ("many items", "many keys")),
     ],
 )
-def test_what_unfolds_or_is_too_much_is_refused(name):
+def test_documents_of_too_many_values_are_refused(name):
     with pytest.raises(yaml.YAMLError, match="more than 20000 values"):
         parse_yaml(BOMBS[name])
 
@@ -84,7 +84,7 @@ def test_nesting_is_refused_before_it_recurses(name):
         ("x" * 5000, "more than 4096 characters"),
     ],
 )
-def test_what_yaml_could_do_and_ours_does_not_is_refused(text, problem):
+def test_unsupported_features_of_yaml_are_refused(text, problem):
     with pytest.raises(yaml.YAMLError, match=problem):
         parse_yaml(text)
 
@@ -232,7 +232,7 @@ def test_a_picture_that_claims_too_much_is_refused_before_room_is_made(tmp_path,
         load_background(written(tmp_path / "empty.png", content), (16, 32))
 
 
-def test_formats_whose_size_is_not_told_before_decoding_are_refused(tmp_path):
+def test_formats_whose_size_is_not_known_before_decoding_are_refused(tmp_path):
     with pytest.raises(TextureError, match="PNG, TIFF or JPEG"):
         load_texture(written(tmp_path / "texture.png", encoded(".webp", np.dstack([pattern()] * 3))))
 

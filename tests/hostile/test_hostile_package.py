@@ -16,7 +16,7 @@ YAML |= {"Loader", "UnsafeLoader", "FullLoader", "CLoader", "CUnsafeLoader", "CF
 
 
 def dangers(tree: ast.AST) -> list[str]:
-    """What of a file could run what another file says."""
+    """Places of a file that could run code from another file."""
     found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import | ast.ImportFrom):
@@ -51,7 +51,7 @@ def _dangers_of_call(call: ast.Call) -> list[str]:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(REPO)))
-def test_no_file_of_the_package_runs_what_a_file_says(path):
+def test_no_file_of_the_package_runs_code_from_a_file(path):
     assert not dangers(ast.parse(path.read_text()))
 
 
@@ -74,10 +74,10 @@ def test_no_file_of_the_package_runs_what_a_file_says(path):
         "subprocess.run(text, shell=True)",
     ],
 )
-def test_what_the_walk_looks_for_is_found(code):
+def test_dangerous_code_is_found(code):
     assert dangers(ast.parse(code))
 
 
-def test_what_is_safe_is_not_found():
+def test_safe_code_is_not_found():
     safe = "yaml.safe_load(t); torch.load(p, weights_only=True); np.load(p, allow_pickle=False); model.eval()"
     assert not dangers(ast.parse(safe))

@@ -1,4 +1,4 @@
-"""Checkpoints: what is written is read, and whatever else a file may be is refused in one line, nothing executed."""
+"""Checkpoints: written ones are read, and any other file is refused in one line, nothing executed."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_the_same_checkpoint_gives_the_same_bytes(tmp_path):
     assert (tmp_path / "a" / "proposer.ckpt").read_bytes() == (tmp_path / "b" / "proposer.ckpt").read_bytes()
 
 
-def test_the_network_of_a_checkpoint_says_what_it_said_before(tmp_path, rng):
+def test_the_network_of_a_checkpoint_predicts_the_same_as_before(tmp_path, rng):
     save_checkpoint(tmp_path / "proposer.ckpt", example())
     network = correlator_of(load_checkpoint(tmp_path / "proposer.ckpt"))
     disks, blurs = 100 * torch.rand(2, 24, 24, generator=rng), torch.randn(32 * 32, 7, generator=rng)
@@ -97,7 +97,7 @@ def test_code_in_a_file_is_not_executed(tmp_path, form):
     assert not mark.exists()
     if form in ("torch", "in the weights"):
         assert "code" in text
-        torch.load(path, weights_only=False)  # that it would have done so otherwise
+        torch.load(path, weights_only=False)  # otherwise it would have done so
         assert mark.exists()
 
 
@@ -138,7 +138,7 @@ def packed(path: Path) -> None:
 
 
 def claims_much(path: Path) -> None:
-    """One whose directory says that an entry is larger than the file."""
+    """One whose directory claims an entry larger than the file."""
     archived_again(path, claimed=2_000_000_000)
 
 
@@ -219,7 +219,7 @@ def test_a_changed_checkpoint_is_refused_in_one_line(tmp_path, case):
     assert words in refused(path)
 
 
-def test_what_would_be_refused_is_not_written(tmp_path):
+def test_a_checkpoint_that_would_be_refused_is_not_written(tmp_path):
     with pytest.raises(CheckpointError, match="finite"):
         save_checkpoint(tmp_path / "bad.ckpt", example(**other_weight(torch.tensor(float("nan")))))
     assert not list(tmp_path.iterdir())
@@ -241,7 +241,7 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch)
     assert [entry.name for entry in tmp_path.iterdir()] == ["proposer.ckpt"]
 
 
-def test_a_map_is_known_by_its_grey_levels_whatever_its_file(tmp_path):
+def test_a_map_is_identified_by_its_grey_levels_in_any_file(tmp_path):
     grey = (255 * random_texture("dots", 2, 64)).round().to(torch.uint8).numpy()
     paths = [tmp_path / name for name in ("a.png", "b.tiff", "c.png")]
     cv2.imwrite(str(paths[0]), grey)

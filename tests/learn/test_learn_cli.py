@@ -1,4 +1,4 @@
-"""`sphereorient train` and `evaluate`: files, words, and refusals of one line."""
+"""`sphereorient train` and `evaluate`: files, messages, and refusals of one line."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_the_figures_are_pictures_with_something_on_them(trained):
 
 
 @pytest.mark.slow
-def test_quiet_says_nothing_and_resume_goes_on(trained, tmp_path):
+def test_quiet_prints_nothing_and_resume_goes_on(trained, tmp_path):
     out = trained[0]
     (tmp_path / "last.ckpt").write_bytes((out / "last.ckpt").read_bytes())
     arguments = ["train", out / "settings.yaml", "--out", tmp_path, "--resume", "--quiet", "--set", "training.epochs=3"]
@@ -145,7 +145,7 @@ def test_evaluating_gives_recall_of_each_degradation_and_level(checkpoint):
     assert all(word in table for word in (*tiny().pictures.degradations, "level 5", "pictures/s"))
 
 
-def test_a_config_says_what_is_tried(checkpoint, tmp_path):
+def test_a_config_gives_the_degradations_of_an_evaluation(checkpoint, tmp_path):
     path = tmp_path / "other.yaml"
     path.write_text(
         yaml.safe_dump({**TINY, "pictures": {**TINY["pictures"], "degradations": ["bubbles"]}, "training": {}})
@@ -156,7 +156,7 @@ def test_a_config_says_what_is_tried(checkpoint, tmp_path):
     assert {one["family"] for one in json.loads(run.output)["families"]} == {"bubbles"}
 
 
-def test_the_wrong_things_to_evaluate_are_one_line(checkpoint, config, tmp_path):
+def test_impossible_inputs_of_evaluate_are_one_line(checkpoint, config, tmp_path):
     assert "none.ckpt" in refused("evaluate", tmp_path / "none.ckpt")
     assert "yaml" in refused("evaluate", config)
     (tmp_path / "empty.yaml").write_text("")  # the default: disks of 40 px

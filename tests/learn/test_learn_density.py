@@ -1,4 +1,4 @@
-"""Densities on a grid: planted tops come out with their weights, their order, and where they are between places."""
+"""Densities on a grid: planted modes come out with weights, order, and rotations between grid points."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def off_deg(a: Tensor, b: Tensor) -> float:
 
 
 def planted(*tops: tuple[Tensor, float]) -> Tensor:
-    """Logits of a mixture of tops (R, weight), with a constant that must not matter."""
+    """Logits of a mixture of modes (R, weight), with an arbitrary constant."""
     density = sum(weight * smoothed_target(R.float()[None], GRID, SPREAD) for R, weight in tops)
     assert isinstance(density, Tensor)
     return density.clamp_min(1e-30).log() + 5.0

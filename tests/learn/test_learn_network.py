@@ -1,4 +1,4 @@
-"""The network: blurs of a map against sums and known laws, features that turn with the ball, pictures of any scale."""
+"""The network: blurs of a map against sums and known laws, features rotate with the ball, pictures of any scale."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DIRECTION = octahedral_directions(SIDE)
 
 
 def smooth_map(R_body_ball: np.ndarray, height: int = 256) -> Tensor:
-    """A ball of a few broad lobes whose paint is turned by a rotation."""
+    """A ball of a few broad lobes with rotated paint."""
     d = map_directions(height).double().numpy() @ R_body_ball  # what was at d before, R^T d as a row
     value = (
         np.exp(4 * (d @ [0.6, 0.0, 0.8] - 1))
@@ -35,7 +35,7 @@ def smooth_map(R_body_ball: np.ndarray, height: int = 256) -> Tensor:
 
 
 @pytest.mark.parametrize("degree", [1, 2])
-def test_a_spherical_harmonic_decays_as_the_kernel_says(degree):
+def test_a_spherical_harmonic_decays_as_the_kernel_predicts(degree):
     """A kernel exp(kappa cos) shrinks those of degree 1 by coth(kappa) - 1 / kappa, of degree 2 by 1 - 3 of it / kappa.
 
     About exp(-l (l + 1) s^2 / 2) where s is small.

@@ -97,7 +97,7 @@ def test_no_map_of_the_validation_or_of_the_trial_is_one_of_the_training(monkeyp
     assert not validation & trial
 
 
-def test_there_are_as_many_validation_pictures_as_the_settings_say(data):
+def test_there_are_as_many_validation_pictures_as_in_the_settings(data):
     assert sum(lesson.disks.shape[0] * lesson.disks.shape[1] for lesson in data.validation) == SETTINGS.validation
 
 
@@ -111,7 +111,7 @@ def test_validation_pictures_are_not_those_of_the_training(data):
     )
 
 
-def test_a_lesson_has_the_shapes_that_it_says(balls):
+def test_a_lesson_has_its_stated_shapes(balls):
     lesson = draw_batch(balls, SETTINGS, generator_of(1), SHAPE)
     assert lesson.blurs.shape[:2] == (2, NODES * NODES)
     assert lesson.disks.shape == (2, 12, 24, 24)
@@ -119,7 +119,7 @@ def test_a_lesson_has_the_shapes_that_it_says(balls):
     assert_close(torch.linalg.det(lesson.R_view_body), torch.ones(2, 12), atol=1e-5)
 
 
-def test_pictures_show_the_map_of_the_blurs_as_the_answer_says(balls):
+def test_pictures_show_the_map_of_the_blurs_at_the_answers_orientation(balls):
     """Without degradations a disk looks like the clean view of its answer, negative or not; not like another's."""
     plain = SETTINGS.model_copy(update={"at_once": 0})
     negatives = 0
@@ -150,7 +150,7 @@ def test_values_between_levels_are_between_those_of_the_levels(name):
     DEGRADATIONS[name].check(value_at(name, 4.999))
 
 
-def test_values_are_drawn_as_the_settings_say():
+def test_values_are_drawn_from_the_ranges_of_the_settings():
     settings = PictureSettings(at_once=2, hardest=3.0)
     drawn = [draw_values(settings, generator_of(k)) for k in range(400)]
     counts = [sum(len(values) == count for values in drawn) for count in range(4)]

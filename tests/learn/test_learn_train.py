@@ -1,4 +1,4 @@
-"""Training in small: it learns, the same seed gives the same weights, and what was cut off goes on as if it had not."""
+"""Training in small: it learns, the same seed gives the same weights, and a resumed training has the same result."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def rows_of(folder: Path) -> list[dict[str, float]]:
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> tuple[Trained, Path]:
-    """A hundred steps: eight seconds on one slow core. It gets better all the time, so the patience is not tried."""
+    """A hundred steps: eight seconds on one slow core. It gets better all the time, so `patience` has no effect."""
     folder = tmp_path_factory.mktemp("trained") / "proposer"
     return train_proposer(tiny(patience=1), folder), folder
 
@@ -58,7 +58,7 @@ def test_training_finds_what_the_untrained_network_does_not(trained):
 
 
 @pytest.mark.slow
-def test_the_checkpoint_is_the_best_of_the_validations_and_says_what_it_is(trained):
+def test_the_checkpoint_is_that_of_the_best_validation_and_holds_its_description(trained):
     result, folder = trained
     loaded = load_checkpoint(folder / "proposer.ckpt")
     assert same(loaded, result.checkpoint)
@@ -82,7 +82,7 @@ def test_the_log_has_a_row_an_epoch(trained):
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_weights_and_another_does_not(short, tmp_path):
-    torch.manual_seed(99)  # what was drawn before does not matter
+    torch.manual_seed(99)  # earlier draws do not matter
     again = train_proposer(tiny(**SHORT), tmp_path / "again")
     assert same(again.checkpoint, short[0].checkpoint)
     assert again.rows == short[0].rows
@@ -93,7 +93,7 @@ def test_the_same_seed_gives_the_same_weights_and_another_does_not(short, tmp_pa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cut", [5, 8, 9])
-def test_what_was_cut_off_goes_on_to_the_same_weights(short, tmp_path, cut):
+def test_an_interrupted_training_goes_on_to_the_same_weights(short, tmp_path, cut):
     """Cut off in the second epoch, at its very end, in the third."""
 
     def interrupt(stage: str, done: int, total: int) -> None:
@@ -103,11 +103,11 @@ def test_what_was_cut_off_goes_on_to_the_same_weights(short, tmp_path, cut):
     with pytest.raises(KeyboardInterrupt):
         train_proposer(tiny(**SHORT), tmp_path, progress=interrupt)
     assert not (tmp_path / "proposer.ckpt").exists()
-    told: list[tuple[str, int]] = []
+    calls: list[tuple[str, int]] = []
     resumed = train_proposer(
-        tiny(**SHORT), tmp_path, resume=True, progress=lambda stage, done, total: told.append((stage, done))
+        tiny(**SHORT), tmp_path, resume=True, progress=lambda stage, done, total: calls.append((stage, done))
     )
-    steps = [done for stage, done in told if stage == "train"]
+    steps = [done for stage, done in calls if stage == "train"]
     assert steps[0] == cut - (cut - 1) % 4  # the epoch that was cut off begins again
     assert same(resumed.checkpoint, short[0].checkpoint)
     assert resumed.checkpoint.temperature == short[0].checkpoint.temperature
@@ -123,7 +123,7 @@ def test_a_training_that_is_finished_can_be_resumed_and_stays(tmp_path):
 
 
 @pytest.mark.slow
-def test_it_goes_on_with_the_same_settings_only_but_may_be_longer(short, tmp_path):
+def test_a_training_resumes_with_the_same_settings_only_but_may_be_longer(short, tmp_path):
     (tmp_path / "last.ckpt").write_bytes((short[1] / "last.ckpt").read_bytes())
     with pytest.raises(CheckpointError, match="same settings"):
         train_proposer(tiny(**SHORT, learning_rate=1e-3), tmp_path, resume=True)
@@ -131,7 +131,7 @@ def test_it_goes_on_with_the_same_settings_only_but_may_be_longer(short, tmp_pat
 
 
 @pytest.mark.parametrize("kind", ["none", "text", "half", "code", "of ours"])
-def test_what_is_no_file_to_go_on_from_is_refused_and_nothing_executed(short, tmp_path, kind):
+def test_a_file_that_is_no_checkpoint_to_resume_from_is_refused_and_nothing_executed(short, tmp_path, kind):
     last, mark = tmp_path / "last.ckpt", tmp_path / "mark.txt"
     whole = (short[1] / "last.ckpt").read_bytes()
     if kind == "text":
@@ -151,7 +151,7 @@ def test_what_is_no_file_to_go_on_from_is_refused_and_nothing_executed(short, tm
 
 @pytest.mark.slow
 def test_a_checkpoint_to_begin_with_gives_its_weights(short, tmp_path):
-    """A learning rate of nearly nothing: the weights stay, whatever the seed."""
+    """A learning rate of nearly zero: the weights stay, with any seed."""
     start = str(short[1] / "proposer.ckpt")
     changed = {"epochs": 1, "steps": 1, "learning_rate": 1e-12, "weight_decay": 0.0}
     tuned = train_proposer(tiny(seed=5, start=start, **changed), tmp_path)
@@ -159,7 +159,7 @@ def test_a_checkpoint_to_begin_with_gives_its_weights(short, tmp_path):
         assert (tuned.checkpoint.state[name] - tensor).abs().max() < 1e-6
 
 
-def test_a_checkpoint_of_another_network_cannot_be_begun_with(short, tmp_path):
+def test_a_checkpoint_of_another_network_is_refused_as_a_start(short, tmp_path):
     tree = {**TINY, "network": {**TINY["network"], "width": 12}, "training": {"start": str(short[1] / "proposer.ckpt")}}
     with pytest.raises(CheckpointError, match="other network settings"):
         train_proposer(ProposerSettings.model_validate(tree), tmp_path / "out")
@@ -194,7 +194,7 @@ def test_training_ends_when_validations_get_no_better(tmp_path):
 
 @pytest.mark.slow
 def test_weights_that_got_worse_are_not_kept(trained, tmp_path):
-    """A learning rate that throws away what was learnt: the best are those of the beginning."""
+    """A learning rate that destroys the weights: the best are those of the beginning."""
     start = trained[1] / "proposer.ckpt"
     result = train_proposer(tiny(epochs=1, steps=3, learning_rate=0.5, start=str(start)), tmp_path)
     assert result.rows[-1]["validation_nll"] > result.rows[0]["validation_nll"] + 0.1
@@ -226,7 +226,7 @@ def test_the_learning_rate_rises_and_falls(monkeypatch):
 
 @pytest.mark.slow
 def test_a_temperature_that_was_planted_is_found(rng):
-    """Logits of half the size want half the temperature, and with it probabilities are those of the outcomes."""
+    """Logits of half the size get half the temperature, and then probabilities are those of the outcomes."""
     grid = untrained().grid
     logits = 14.0 * torch.nn.functional.normalize(torch.randn(200, 9, generator=rng), dim=1) @ grid.flatten(1).T
     truth = grid[torch.multinomial(logits.softmax(1), 1, generator=rng)[:, 0]]
@@ -252,7 +252,7 @@ def test_judging_counts_right_and_wrong(rng):
 
 
 @pytest.mark.slow
-def test_the_network_of_the_checkpoint_is_as_good_as_the_log_says(trained):
+def test_the_network_of_the_checkpoint_is_as_good_as_in_the_log(trained):
     """Loaded anew, on the same validation pictures."""
     from sphereorient.learn.metrics import joined_predictions, predict
     from sphereorient.learn.train import TrainingData

@@ -1,4 +1,4 @@
-"""Modules that stand for harvesters, pypylon and vmbpy, with cameras that misbehave as they are told to."""
+"""Modules that stand for harvesters, pypylon and vmbpy, with cameras that misbehave on request."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class TimeoutException(Exception):
 
 @dataclass
 class Body:
-    """A camera. `script`: for each time that it is opened, what it gives; at its end nothing more comes."""
+    """A camera. `script`: the pictures of each opening; after the last one nothing comes."""
 
     serial: str
     script: list[Iterator[Any]] = field(default_factory=list)
@@ -48,7 +48,7 @@ class Body:
         self.seen, self._things = True, self.script.pop(0) if self.script else iter(())
 
     def next(self, limit_s: float) -> Picture | None:
-        """Return what comes within a time; raise at a fault."""
+        """Return the next picture within a time; raise at a fault."""
         thing = next(self._things, TIMEOUT)
         if thing is TIMEOUT:
             time.sleep(min(limit_s, 0.002))

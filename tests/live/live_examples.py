@@ -25,7 +25,7 @@ _KNOWN: list[Path] = []
 
 
 def known(places: pytest.TempPathFactory) -> Path:
-    """What `live` learns of the excerpt before its first frame, learnt once for all files of tests."""
+    """The appearance that `live` learns of the excerpt, learnt once for all files of tests."""
     if not _KNOWN:
         path = places.mktemp("known") / "learnt.h5"
         with open_live(EXCERPT / "experiment.yaml", Settings(), None, None) as opened:

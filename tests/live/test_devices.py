@@ -1,4 +1,4 @@
-"""Cameras of makers and of OpenCV: one behaviour, whatever their drivers do."""
+"""Cameras of makers and of OpenCV behave alike with any driver."""
 
 import struct
 import sys
@@ -79,7 +79,7 @@ def with_keys(recording: Recording, **keys: DeviceKeys) -> Recording:
     return replace(recording, experiment=replace(recording.experiment, devices=keys))
 
 
-def test_pictures_are_copies_with_the_devices_time_and_what_waits_is_asked_again(maker, alone, monkeypatch):
+def test_pictures_are_copies_with_the_devices_time_and_waiting_ones_are_read_again(maker, alone, monkeypatch):
     camera = body([TIMEOUT, (grey(1), 70.0, 5), TIMEOUT, TIMEOUT, (grey(2), 70.25, 6), (grey(3), 70.5, 8)])
     install(maker, [camera], monkeypatch)
     frames = source_of(f"{maker}4711", print).frames(alone)
@@ -92,7 +92,7 @@ def test_pictures_are_copies_with_the_devices_time_and_what_waits_is_asked_again
     assert camera.log[-1] == "closed"
 
 
-def test_a_device_is_set_as_the_experiment_says(maker, alone, monkeypatch):
+def test_a_device_is_set_as_in_the_experiment(maker, alone, monkeypatch):
     camera = body([(grey(1), 1.0, 1)])
     install(maker, [camera], monkeypatch)
     keys = DeviceKeys(trigger="Line1", exposure_ms=0.4, rate_hz=600.0, pixel_format="Mono8", offset=(8, 4))
@@ -148,7 +148,7 @@ def test_all_that_a_device_does_not_take_is_named_in_one_line(maker, alone, monk
     assert camera.log[-1] == "closed"
 
 
-def test_a_device_that_takes_another_value_is_told(alone, monkeypatch):
+def test_a_device_that_takes_another_value_is_reported(alone, monkeypatch):
     camera = body([(grey(1), 1.0, 1)])
     camera.set = lambda name, value: camera.features.update(
         {name: min(value, 100.0) if name == "ExposureTime" else value}
@@ -167,32 +167,32 @@ def test_other_pixels_are_refused(maker, form, alone, monkeypatch):
     assert camera.log[-1] == "closed"
 
 
-def test_a_camera_that_vanishes_is_told_once_and_taken_up_again(maker, alone, monkeypatch):
+def test_a_camera_that_vanishes_is_reported_once_and_taken_up_again(maker, alone, monkeypatch):
     first, again = [(grey(1), 50.0, 90), GONE], [(grey(2), 3.0, 1), (grey(3), 3.1, 2)]
-    camera, told = body(first, again), []
+    camera, messages = body(first, again), []
     install(maker, [camera], monkeypatch)
-    frames = source_of(f"{maker}4711", told.append).frames(alone)
+    frames = source_of(f"{maker}4711", messages.append).frames(alone)
     found = list(islice(frames, 3))
     frames.close()
     assert [int(one.pictures[0][0, 0]) for one in found] == [1, 2, 3]
-    assert all(a.time_s < b.time_s for a, b in pairwise(found)), "its clock began anew"
+    assert all(a.time_s < b.time_s for a, b in pairwise(found)), "its clock restarted"
     name = maker.replace("maker.cti#", "") + "4711"
-    assert [line.split(";")[0] for line in told] == [
+    assert [line.split(";")[0] for line in messages] == [
         f"{name}: expected a working camera, got 'it was removed'",
         f"{name}: pictures arrive again.",
     ]
-    assert told[0].endswith("It is reopened each second.")
+    assert messages[0].endswith("It is reopened each second.")
     assert camera.log.count("closed") == camera.log.count("opened") == 2
 
 
-def test_a_picture_that_is_not_whole_is_told(maker, alone, monkeypatch):
-    camera, told = body([(grey(1), 1.0, 1), (None, 1.1, 2), (grey(3), 1.2, 3), (grey(4), 1.3, 4)]), []
+def test_a_picture_that_is_not_whole_is_reported(maker, alone, monkeypatch):
+    camera, messages = body([(grey(1), 1.0, 1), (None, 1.1, 2), (grey(3), 1.2, 3), (grey(4), 1.3, 4)]), []
     install(maker, [camera], monkeypatch)
-    frames = source_of(f"{maker}4711", told.append).frames(alone)
+    frames = source_of(f"{maker}4711", messages.append).frames(alone)
     whole = [one for one in islice(frames, 3 if "genicam" in maker else 4) if one.pictures[0] is not None]
     frames.close()
     assert [(one.number, int(one.pictures[0][0, 0])) for one in whole] == [(0, 1), (2, 3), (3, 4)]
-    (line,) = told
+    (line,) = messages
     assert "cam1 missing 1" in line or "cam1 incomplete 1" in line
 
 
@@ -219,12 +219,12 @@ def test_the_first_genicam_camera_needs_no_number(alone, monkeypatch):
 
 
 def test_live_ends_and_releases_the_camera_while_it_waits_for_its_trigger(maker, alone, monkeypatch):
-    camera, told = body(), []
+    camera, messages = body(), []
     install(maker, [camera], monkeypatch)
-    source = source_of(f"{maker}4711", told.append)
+    source = source_of(f"{maker}4711", messages.append)
     feed = Feed(source.frames(with_keys(alone, cam1=DeviceKeys(trigger="Line1"))), most=64, wait=False)
-    until(lambda: told)
-    assert told == ["waiting for the first trigger."]
+    until(lambda: messages)
+    assert messages == ["waiting for the first trigger."]
     feed.close()
     source.close()
     assert camera.log[-1] == "closed"
@@ -263,13 +263,13 @@ def filmed(
             yield grey(k), zero_s + (1 + 3e-5 * number) * 0.015 * k, k
 
 
-def test_two_cameras_film_in_step_and_what_lacks_is_told(maker, both, monkeypatch):
-    begun_s, told = time.perf_counter() + 0.3, []
+def test_two_cameras_film_in_step_and_what_is_missing_is_reported(maker, both, monkeypatch):
+    begun_s, messages = time.perf_counter() + 0.3, []
     first = body(serial="a")
     second = body(serial="b")
     first.script, second.script = [filmed(1, begun_s, (60,), 9e3)], [filmed(2, begun_s, (80,), 0.0, stuck=90)]
     install(maker, [first, second], monkeypatch)
-    source = source_of(f"{maker}a,b", told.append)
+    source = source_of(f"{maker}a,b", messages.append)
     keys = {name: DeviceKeys(trigger="Line1") for name in ("cam1", "cam2")}
     feed = Feed(source.frames(with_keys(both, **keys)), most=1000, wait=True)
     found = []
@@ -284,25 +284,25 @@ def test_two_cameras_film_in_step_and_what_lacks_is_told(maker, both, monkeypatc
     assert at[60] == [None, 60]
     assert at[80] == [80, None]
     assert np.mean([at[k] == [k, k] for k in range(40, 90)]) > 0.7
-    assert told[0] == "waiting for the first trigger."
-    assert 1 < len(told) < 5
-    assert "unused or missing" in told[1]
+    assert messages[0] == "waiting for the first trigger."
+    assert 1 < len(messages) < 5
+    assert "unused or missing" in messages[1]
     assert first.log[-1] == second.log[-1] == "closed"
 
 
 def test_one_camera_goes_on_while_the_other_is_gone(maker, both, monkeypatch):
-    begun_s, told = time.perf_counter() + 0.1, []
+    begun_s, messages = time.perf_counter() + 0.1, []
     first, second = body(serial="a"), body(serial="b")
     first.script = [filmed(1, begun_s, (), 5.0)]
     second.script = [iter([*[(grey(k), 0.02 * k, k) for k in range(3)], GONE])]
     install(maker, [first, second], monkeypatch)
-    source = source_of(f"{maker}a,b", told.append)
+    source = source_of(f"{maker}a,b", messages.append)
     feed = Feed(source.frames(both), most=1000, wait=True)
     found = list(islice(feed, 40))
     feed.close()
     source.close()
     assert sum(one.pictures[0] is not None for one in found) > 30
-    assert any("It is reopened each second." in line for line in told)
+    assert any("It is reopened each second." in line for line in messages)
 
 
 def test_a_fault_of_one_of_two_at_the_start_ends_both(maker, both, monkeypatch):
@@ -370,8 +370,8 @@ def test_opencv_sets_rate_and_size_alone(alone, monkeypatch):
         next(source_of("camera:0", print).frames(with_keys(alone, cam1=DeviceKeys(exposure_ms=0.4, trigger="Line1"))))
 
 
-def test_a_camera_of_opencv_that_ends_or_changes_its_pictures_is_told_once_and_taken_up_again(alone, monkeypatch):
-    told: list[str] = []
+def test_a_camera_of_opencv_that_ends_or_changes_its_pictures_is_reported_once_and_taken_up_again(alone, monkeypatch):
+    messages: list[str] = []
     devices = [
         Capture([grey(1), grey(2)]),
         Capture([], opens=False),
@@ -382,12 +382,12 @@ def test_a_camera_of_opencv_that_ends_or_changes_its_pictures_is_told_once_and_t
         Capture([grey(7)]),
     ]
     opencv(monkeypatch, *devices)
-    frames = source_of("camera:0", told.append).frames(alone)
+    frames = source_of("camera:0", messages.append).frames(alone)
     found = list(islice(frames, 5))
     assert [int(one.pictures[0][0, 0]) for one in found] == [1, 2, 3, 5, 7]
     assert [one.number for one in found] == [0, 1, 2, 3, 4]
     assert all(a.time_s < b.time_s for a, b in pairwise(found))
-    assert [line.split(";")[0] for line in told] == [
+    assert [line.split(";")[0] for line in messages] == [
         "camera:0: pictures have stopped. It is reopened each second.",
         "camera:0: pictures arrive again.",
         "camera:0: pictures have stopped. It is reopened each second.",
@@ -410,7 +410,7 @@ TURNS = {90: (0, -1, 1, 0), 180: (-1, 0, 0, -1)}  # of a display matrix
 
 
 def tag(path: Path, angle: int) -> None:
-    """Write a turn into the track header of an MP4 file: players, and OpenCV unless told, turn its pictures."""
+    """Write a rotation into the track header of an MP4 file: players, and OpenCV by default, rotate its pictures."""
     content = bytearray(path.read_bytes())
     a, b, c, d = (value << 16 for value in TURNS[angle])
     at = content.index(b"tkhd") + 44
@@ -445,7 +445,7 @@ def test_a_movie_with_a_rotation_tag_comes_as_track_reads_it(angle, tmp_path):
 
 @pytest.mark.slow  # two seconds of a film, and its set-up
 def test_two_cameras_in_step_give_right_poses(monkeypatch, tmp_path_factory):
-    order, told = [*range(40), *range(38, -1, -1)], []
+    order, messages = [*range(40), *range(38, -1, -1)], []
 
     def film(pictures: list[np.ndarray], seed: int, lost: int, twice: int) -> Iterator[Any]:
         random, zero_s = np.random.default_rng(seed), 1e3 * seed
@@ -462,7 +462,7 @@ def test_two_cameras_in_step_give_right_poses(monkeypatch, tmp_path_factory):
         begun_s = time.perf_counter() + 0.5
         first.script, second.script = [film(movies[0], 1, 40, 50)], [film(movies[1], 2, 60, 45)]
         install("pylon:", [first, second], monkeypatch)
-        source = source_of("pylon:a,b", told.append)
+        source = source_of("pylon:a,b", messages.append)
         feed = Feed(source.frames(opened.recording), most=1000, wait=True)
         found = list(
             islice(measured(opened.tracker, opened.tracker.appearances[""].fitter.views, feed), len(order) - 1)
@@ -473,7 +473,7 @@ def test_two_cameras_in_step_give_right_poses(monkeypatch, tmp_path_factory):
     assert len(there) > len(found) - 4
     assert all(off_deg(now, order[now.number]) < 0.5 for now in there)
     assert sum(now.reason == (Reason.OK, Reason.OK) for now in found) > 10, "pairs come also where the machine is busy"
-    assert any("cam1 missing 1" in line or "cam1 doubled 1" in line or "cam2 doubled 1" in line for line in told)
+    assert any("cam1 missing 1" in line or "cam1 doubled 1" in line or "cam2 doubled 1" in line for line in messages)
 
 
 @pytest.mark.slow

@@ -33,7 +33,7 @@ def test_a_feed_that_waits_gives_all_frames_in_order():
 
 
 def test_a_frame_that_waits_for_the_tracking_arrives_when_it_is_taken():
-    """Frames of movie-fast are read ahead: the time in which they wait is no latency."""
+    """Frames of movie-fast are read ahead: their waiting time is no latency."""
     with open_recording(EXCERPT / "experiment.yaml") as recording:
         frames = iter(Feed(movie_frames(recording, paced=False), 4, wait=True))
         for _ in range(8):
@@ -41,7 +41,7 @@ def test_a_frame_that_waits_for_the_tracking_arrives_when_it_is_taken():
             assert before_s <= next(frames).arrived_s <= time.perf_counter()
 
 
-def test_of_a_camera_that_is_too_fast_frames_are_passed_over_in_steps_that_grow():
+def test_frames_of_a_camera_that_is_too_fast_are_skipped_in_growing_steps():
     goes_on, numbers = Semaphore(9), []
     feed = Feed(let(60, goes_on), 64, wait=False)
     frames = iter(feed)
@@ -196,7 +196,7 @@ def test_a_recording_lies_as_the_movies_do_that_flip_mirrors(recording):
     np.testing.assert_array_equal(took[1], shown[1][::-1])
 
 
-def test_a_ring_that_ends_or_is_another_one_is_told(recording, tmp_path):
+def test_a_ring_that_ends_or_is_another_one_is_reported(recording, tmp_path):
     path = tmp_path / "ring"
     with pytest.raises(MovieError, match="expected a ring of frames"):
         next(shared_frames(path, recording.streams))
@@ -215,9 +215,9 @@ def test_a_ring_that_ends_or_is_another_one_is_told(recording, tmp_path):
         assert list(frames) == []
 
 
-def test_a_source_that_stalls_is_told_once_and_told_when_it_comes_back(monkeypatch):
+def test_a_source_that_stalls_is_reported_once_and_reported_when_it_comes_back(monkeypatch):
     monkeypatch.setattr("sphereorient.live.feed.STALLED_S", 0.02)
-    told: list[str] = []
+    messages: list[str] = []
     goes_on = Event()
 
     def source() -> Iterator[Arrival]:
@@ -226,25 +226,25 @@ def test_a_source_that_stalls_is_told_once_and_told_when_it_comes_back(monkeypat
         yield from arrivals(3)
 
     found = []
-    for arrival in Feed(source(), 10, wait=True, log=lambda line: (told.append(line), goes_on.set())):
+    for arrival in Feed(source(), 10, wait=True, log=lambda line: (messages.append(line), goes_on.set())):
         found.append(arrival.number)
     assert found == [0, 1, 2, 0, 1, 2]
-    assert re.fullmatch(r"source: no frame for 0\.\d s; tracking waits\.", told[0])
-    assert re.fullmatch(r"source: frames arrive again, after 0\.\d s\.", told[1])
-    assert len(told) == 2
+    assert re.fullmatch(r"source: no frame for 0\.\d s; tracking waits\.", messages[0])
+    assert re.fullmatch(r"source: frames arrive again, after 0\.\d s\.", messages[1])
+    assert len(messages) == 2
 
 
 def test_a_slow_source_does_not_stall(monkeypatch):
     monkeypatch.setattr("sphereorient.live.feed.STALLED_S", 0.005)
-    told: list[str] = []
+    messages: list[str] = []
 
     def source() -> Iterator[Arrival]:
         for arrival in arrivals(8):
             time.sleep(0.02)
             yield replace(arrival, arrived_s=time.perf_counter())
 
-    list(Feed(source(), 10, wait=True, log=told.append))
-    assert len(told) <= 4  # before the second frame nothing is known of the rate
+    list(Feed(source(), 10, wait=True, log=messages.append))
+    assert len(messages) <= 4  # before the second frame the rate is unknown
 
 
 def test_a_ring_that_another_one_replaces_is_read_on(recording, tmp_path):

@@ -20,7 +20,7 @@ def followed(tracker: LearningTracker, ball, numbers, wait: int = -1):
     """
     R, maps, lasting = [], [], []
     for k in numbers:
-        ((poses, searched),) = tracker.next(k / RATE_HZ, [ball.shots[k]]).values()
+        ((poses, searched),) = tracker.next(k / RATE_HZ, [ball.frames[k]]).values()
         assert searched == (k == 0), k
         assert supported(poses)
         R.append(poses.R_lab_body[0])

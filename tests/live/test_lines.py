@@ -39,7 +39,7 @@ def test_lines_are_the_rows_of_the_exported_table(track):
 
 
 def test_json_has_null_for_what_is_not_known(track):
-    known, lost = told(rows(track), fixed=True)[6:8]
+    known, lost = lines_of(rows(track), fixed=True)[6:8]
     assert known["valid"]
     assert known["sigma_rad"] == pytest.approx([1e-3] * 3)
     assert math.hypot(*known["quaternion_wxyz"]) == pytest.approx(1)
@@ -51,18 +51,18 @@ def forms(frames: Iterable[Measured], known: Quantities) -> list[Forms]:
     return [Forms(now, table, known) for now in frames]
 
 
-def told(frames: Iterable[Measured], fixed: bool, unit: str = "mm") -> list[dict]:
+def lines_of(frames: Iterable[Measured], fixed: bool, unit: str = "mm") -> list[dict]:
     return [json.loads(one.json) for one in forms(frames, Quantities(fixed, unit))]
 
 
 def test_json_names_flags(track):
     frames = [replace(now, flags=int(Flag.ONE_CAMERA | Flag.DOUBTFUL_FIT)) for now in rows(track)][:1]
-    assert told(frames, fixed=True)[0]["flags"] == ["ONE_CAMERA", "DOUBTFUL_FIT"]
-    assert told(rows(track), fixed=True)[0]["flags"] == []
+    assert lines_of(frames, fixed=True)[0]["flags"] == ["ONE_CAMERA", "DOUBTFUL_FIT"]
+    assert lines_of(rows(track), fixed=True)[0]["flags"] == []
 
 
 def test_the_keys_of_lengths_name_their_unit(track):
-    in_mm, in_radii = (told(rows(track), fixed=False, unit=unit)[6] for unit in ("mm", "radii"))
+    in_mm, in_radii = (lines_of(rows(track), fixed=False, unit=unit)[6] for unit in ("mm", "radii"))
     lengths = {"position_lab_mm": "position_radii"} | {
         key: key.replace("mm", "radii") for key in ("sigma_mm", "velocity_mm_s", "sigma_velocity_mm_s")
     }
@@ -94,13 +94,13 @@ def test_json_has_the_rates_of_the_motion_so_far():
         replace(now, position_lab_mm=X, covariance=1e-8 * np.eye(6))
         for now, X in zip(rows(whole), whole.position, strict=True)
     ]
-    lines = told(frames, fixed=False)
+    lines = lines_of(frames, fixed=False)
     for line, omega, velocity in [*zip(lines, whole.omega_lab, whole.velocity, strict=True)][-10:]:
         np.testing.assert_allclose(line["omega_rad_s"], omega, atol=5 * max(line["sigma_omega_rad_s"]))
         np.testing.assert_allclose(line["velocity_mm_s"], 1e3 * velocity, atol=5 * max(line["sigma_velocity_mm_s"]))
         assert max(line["sigma_omega_rad_s"]) < 0.1 * np.linalg.norm(omega)
     assert lines[10]["omega_rad_s"] == [None] * 3
-    held = told(frames, fixed=True)
+    held = lines_of(frames, fixed=True)
     assert {tuple(line["velocity_mm_s"]) for line in held} == {(None,) * 3}
     assert [line["omega_rad_s"] for line in held] == [line["omega_rad_s"] for line in lines]
 
@@ -108,12 +108,12 @@ def test_json_has_the_rates_of_the_motion_so_far():
 def test_rates_begin_anew_where_the_ball_was_searched_for_lost_or_measured_by_another_map():
     frames = list(rows(true_track()))
     frames[34] = replace(frames[34], found=True)
-    assert unknown(told(frames, fixed=True)) == [34, 35]
+    assert unknown(lines_of(frames, fixed=True)) == [34, 35]
     frames = list(rows(true_track()))
     frames[34] = replace(frames[34], covariance=np.full((6, 6), np.nan))
-    assert unknown(told(frames, fixed=True)) == [34, 35, 36]
+    assert unknown(lines_of(frames, fixed=True)) == [34, 35, 36]
     frames = [replace(now, map_number=1 + (k >= 34)) for k, now in enumerate(rows(true_track()))]
-    assert unknown(told(frames, fixed=True)) == [34, 35]
+    assert unknown(lines_of(frames, fixed=True)) == [34, 35]
 
 
 def unknown(lines: list[dict]) -> list[int]:

@@ -24,7 +24,7 @@ from sphereorient.follow.ball import BallTracker
 from sphereorient.live.sources import movie_frames
 
 
-def test_frames_one_by_one_are_as_good_as_a_whole_run_and_a_black_out_is_told(tmp_path_factory):
+def test_frames_one_by_one_are_as_good_as_a_whole_run_and_a_black_out_is_reported(tmp_path_factory):
     hidden = range(15, 19)
     with excerpt_opened(tmp_path_factory) as opened:
         frames = [
@@ -41,8 +41,8 @@ def test_frames_one_by_one_are_as_good_as_a_whole_run_and_a_black_out_is_told(tm
             assert now.error_rad < math.radians(0.2)
 
 
-def test_a_jump_is_found_and_told(tmp_path_factory):
-    """From one frame to the next the ball turns by some tens of degrees, forty times as fast as before."""
+def test_a_jump_is_found_and_reported(tmp_path_factory):
+    """From one frame to the next the ball rotates by some tens of degrees, forty times as fast as before."""
     order = [*range(12), *range(39, 29, -1)]
     truth = torch.from_numpy(true_track().orientation)
     assert float(so3.geodesic_distance(truth[11], truth[39])) > math.radians(20)
@@ -56,11 +56,11 @@ def test_a_jump_is_found_and_told(tmp_path_factory):
         assert off_deg(now, k) < 0.2
 
 
-def test_a_jump_wants_no_long_search_and_a_hidden_ball_one_a_second(monkeypatch, tmp_path_factory):
-    """The ball turns by some tens of degrees at once; later something grey without any paint is before it."""
+def test_a_jump_needs_no_long_search_and_a_hidden_ball_one_a_second(monkeypatch, tmp_path_factory):
+    """The ball rotates by some tens of degrees at once; later something grey without any paint is before it."""
     asked: list[int] = []
     long_search = BallTracker.searched
-    monkeypatch.setattr(BallTracker, "searched", lambda self, shots: asked.append(1) or long_search(self, shots))
+    monkeypatch.setattr(BallTracker, "searched", lambda self, frames: asked.append(1) or long_search(self, frames))
     order, hidden = [*range(8), *range(39, 30, -1)], range(12, 15)
     with excerpt_opened(tmp_path_factory) as opened:
         frames = list(movie_frames(opened.recording, paced=False))
@@ -107,7 +107,7 @@ def test_the_command_writes_and_sends_each_frame(tmp_path):
     assert len((tmp_path / "a.jsonl").read_text().splitlines()) == 40
 
 
-def test_what_is_recorded_beside_is_an_experiment_again(tmp_path, tmp_path_factory):
+def test_the_recording_beside_live_is_an_experiment(tmp_path, tmp_path_factory):
     command = ["live", str(EXCERPT / "experiment.yaml"), "--source", "movie-fast", "--learnt"]
     more = [str(known(tmp_path_factory)), "--record", str(tmp_path / "run.mkv")]
     run = CliRunner().invoke(app, [*command, *more])
@@ -140,7 +140,7 @@ def test_what_is_recorded_beside_is_an_experiment_again(tmp_path, tmp_path_facto
         (["--source", "camera:"], "expected movie"),
     ],
 )
-def test_what_live_does_not_know_is_refused(options, message, monkeypatch):
+def test_unknown_outputs_and_sources_of_live_are_refused(options, message, monkeypatch):
     monkeypatch.setattr("sphereorient.methods.precise.learn", lambda job, progress: pytest.fail("too late"))
     run = CliRunner().invoke(app, ["live", str(EXCERPT / "experiment.yaml"), *options])
     assert run.exit_code != 0

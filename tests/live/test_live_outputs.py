@@ -72,7 +72,7 @@ def test_a_slow_reader_loses_lines_and_takes_no_time():
         output.close()
 
 
-def test_a_port_in_use_is_told():
+def test_a_port_in_use_is_refused():
     with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(OutputError, match="expected a free port"):
         TcpOutput("127.0.0.1", taken.getsockname()[1])
 
@@ -88,7 +88,7 @@ def test_udp_sends_a_datagram_a_line():
         UdpOutput("127.0.0.1", 9).send("nobody is there")
 
 
-def test_a_host_that_nobody_knows_is_told():
+def test_an_unknown_host_is_refused():
     with pytest.raises(OutputError, match="expected a host"):
         UdpOutput("no such host", 9)
     with pytest.raises(OutputError, match="expected a host"):
@@ -115,19 +115,19 @@ def test_a_file_grows_line_by_line_and_replaces_none(tmp_path):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a full device")
-def test_a_full_disk_is_told_once_and_does_not_stop(tmp_path):
-    told: list[str] = []
-    output = FileOutput(tmp_path / "full.dat", told.append)
+def test_a_full_disk_is_reported_once_and_does_not_stop(tmp_path):
+    messages: list[str] = []
+    output = FileOutput(tmp_path / "full.dat", messages.append)
     output._file = Path("/dev/full").open("wb")  # noqa: SIM115
     output.send("1")
-    until(lambda: told)
+    until(lambda: messages)
     output.send("2")
     output.close()
-    assert len(told) == 1
-    assert "expected a disk with room" in told[0]
+    assert len(messages) == 1
+    assert "expected a disk with room" in messages[0]
 
 
-def test_a_disk_that_hangs_holds_nobody_up_and_what_is_lost_is_counted():
+def test_a_disk_that_hangs_holds_nothing_up_and_lost_lines_are_counted():
     going, written = Event(), []
 
     def write(things: list[int]) -> None:
@@ -226,40 +226,40 @@ def test_a_serial_reader_gets_all_lines_in_order(line):
     assert got.decode().splitlines() == [f"FT, {k}, {'x' * 300}" for k in range(LINES)]
 
 
-def test_a_serial_reader_that_does_not_read_holds_nothing_up_and_is_told(line):
+def test_a_serial_reader_that_does_not_read_holds_nothing_up_and_is_reported(line):
     _, port = line
-    told: list[str] = []
-    output = SerialOutput(f"{port}@115200", told.append)
+    messages: list[str] = []
+    output = SerialOutput(f"{port}@115200", messages.append)
     for k in range(LINES):
         output.send(f"{k}, {'x' * 300}")
     output.close()
-    (only,) = told
+    (only,) = messages
     assert "lines are lost" in only
     SerialOutput(f"{port}@115200", pytest.fail).close()  # the port is free again
 
 
-def test_a_serial_port_that_vanishes_is_told_once(line):
+def test_a_serial_port_that_vanishes_is_reported_once(line):
     reader, port = line
-    told: list[str] = []
-    output = SerialOutput(f"{port}@115200", told.append)
+    messages: list[str] = []
+    output = SerialOutput(f"{port}@115200", messages.append)
     os.close(reader)
     output.send("1")
-    until(lambda: told)
+    until(lambda: messages)
     for k in range(2 * SOON_LINES):
         output.send(str(k))
     output.close()
-    (only,) = told
+    (only,) = messages
     assert "expected a port that takes lines" in only
 
 
 @pytest.mark.parametrize("rate", ["", "@", "@fast", "@0", "@-9600", "@²", "@99999999999999999999"])
-def test_what_is_no_baud_rate_is_told(line, rate):
-    with pytest.raises(OutputError, match="baud rate") as told:
+def test_an_impossible_baud_rate_is_refused(line, rate):
+    with pytest.raises(OutputError, match="baud rate") as messages:
         SerialOutput(f"{line[1]}{rate}", pytest.fail)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(messages.value)
 
 
-def test_a_serial_port_in_use_or_missing_and_a_file_are_told(line, tmp_path):
+def test_a_serial_port_in_use_or_missing_and_a_file_are_refused(line, tmp_path):
     (tmp_path / "file").write_text("mine")
     output = SerialOutput(f"{line[1]}@9600", pytest.fail)
     for port in (line[1], tmp_path / "none", tmp_path / "file"):
@@ -282,9 +282,9 @@ def test_an_osc_reader_gets_a_message_a_frame_in_order():
     dispatcher = pytest.importorskip("pythonosc.dispatcher", reason="the extra `live`")
     server = pytest.importorskip("pythonosc.osc_server", reason="the extra `live`")
     got: list[tuple[float, ...]] = []
-    told = dispatcher.Dispatcher()
-    told.map("/sphereorient", lambda address, *values: got.append(values))
-    with server.BlockingOSCUDPServer(("127.0.0.1", 0), told) as reader:
+    messages = dispatcher.Dispatcher()
+    messages.map("/sphereorient", lambda address, *values: got.append(values))
+    with server.BlockingOSCUDPServer(("127.0.0.1", 0), messages) as reader:
         Thread(target=reader.serve_forever, args=(0.01,), daemon=True).start()
         output = OscOutput("127.0.0.1", reader.server_address[1])
         for k in range(LINES):
@@ -301,7 +301,7 @@ def test_an_osc_reader_gets_a_message_a_frame_in_order():
 def stream():
     pytest.importorskip("pylsl", reason="the extra `live`")
     output = LslOutput(f"ball {os.getpid()}", pytest.fail)
-    output.send(numbers(-1))  # whoever listens knows it from the first frame on
+    output.send(numbers(-1))  # so that readers find the stream from the first frame on
     yield output
     output.close()
 
@@ -336,7 +336,7 @@ def test_an_lsl_reader_gets_all_samples_in_order_with_names_units_and_lsl_times(
 
     until(pulled)
     assert frames == list(range(LINES))
-    assert begun_s - 0.1 < stamps[0] < begun_s + LIMIT_S  # by LSL's clock, whatever that of the source
+    assert begun_s - 0.1 < stamps[0] < begun_s + LIMIT_S  # by LSL's clock, for any clock of the source
     reader.close_stream()
 
 
@@ -372,7 +372,7 @@ def test_without_its_package_an_output_names_the_extra(kind, name, monkeypatch):
         open_output(name, pytest.fail)
 
 
-def test_without_liblsl_it_is_told_in_a_line(monkeypatch):
+def test_without_liblsl_the_refusal_is_one_line(monkeypatch):
     def absent(name: str, extra: str) -> None:
         raise RuntimeError("LSL binary library file was not found.\nPlease make sure ...")
 

@@ -67,7 +67,7 @@ def blocks_of(run) -> TrackBlocks:
     return TrackBlocks(recording=run[0], tracker=run[1], even=True, settings=Settings(), command="sphereorient live")
 
 
-def test_the_track_says_of_each_frame_what_was_measured(run, tmp_path):
+def test_the_track_states_of_each_frame_what_was_measured(run, tmp_path):
     blocks, path = blocks_of(run), tmp_path / "track.h5"
     output = TrackOutput(path, pytest.fail)
     output.begin(blocks)
@@ -145,7 +145,7 @@ def test_a_journal_that_was_cut_anywhere_is_the_track_until_there(run, tmp_path)
             Trajectory.load(journal.journal_path(path))
 
 
-def test_what_is_there_is_not_written_over(tmp_path):
+def test_existing_files_are_not_replaced(tmp_path):
     for name in ("track.h5", "track.h5.partial"):
         (tmp_path / name).write_text("mine")
         with pytest.raises(OutputError, match="expected a new file"):
@@ -154,21 +154,21 @@ def test_what_is_there_is_not_written_over(tmp_path):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a full device")
-def test_a_full_disk_is_told_and_the_rows_before_it_stay(run, tmp_path):
-    told: list[str] = []
+def test_a_full_disk_is_reported_and_the_rows_before_it_stay(run, tmp_path):
+    messages: list[str] = []
     blocks = blocks_of(run)
-    output = TrackOutput(tmp_path / "track.h5", told.append)
+    output = TrackOutput(tmp_path / "track.h5", messages.append)
     output.begin(blocks)
     output.send(run[2][0])
     until(lambda: len(Trajectory.load(tmp_path / "track.h5")) == 1)
     output._file.close()
     output._file = Path("/dev/full").open("wb")  # noqa: SIM115
     output.send(run[2][1])
-    until(lambda: told)
+    until(lambda: messages)
     output.send(run[2][2])
     output.close()
-    assert len(told) == 1
-    assert "expected a disk with room" in told[0]
+    assert len(messages) == 1
+    assert "expected a disk with room" in messages[0]
     assert len(Trajectory.load(tmp_path / "track.h5")) == 1
 
 

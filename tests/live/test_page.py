@@ -1,4 +1,4 @@
-"""The page of `live`: what it shows is what was measured; who may ask; and that it holds nothing up."""
+"""The page of `live` shows the measured poses, answers only requests with its token, and holds nothing up."""
 
 import base64
 import json
@@ -46,7 +46,7 @@ def arrivals(recording) -> list[Arrival]:
 
 
 def poses():
-    """The excerpt's truth, told as if it were measured; frames 7 and 8 have none."""
+    """The excerpt's truth, as if it were measured; frames 7 and 8 have none."""
     track = true_track()
     orientation, position = track.orientation.copy(), track.position.copy()
     orientation[7:9] = np.nan
@@ -57,25 +57,25 @@ def poses():
 
 @dataclass
 class Shown:
-    """A page after some frames, and what the loop knows of it."""
+    """A page after some frames, and its state in the loop."""
 
     page: LivePage
     running: Event
-    told: list[str]
+    messages: list[str]
 
 
 @contextmanager
 def shown(recording, arrivals: list[Arrival], folder: Path, count: int, save_map=None) -> Iterator[Shown]:
     ours, theirs = Pipe()
-    running, told = Event(), []
+    running, messages = Event(), []
     running.set()
-    writer = PageWriter(folder, ours, told.append)
+    writer = PageWriter(folder, ours, messages.append)
     writer.begin(recording, running, save_map)
     for arrival, now, _ in zip(arrivals, poses(), range(count), strict=False):
         writer.saw(arrival, now)
     page = LivePage(recording, folder, theirs)
     Thread(target=page.follow, daemon=True).start()
-    yield Shown(page, running, told)
+    yield Shown(page, running, messages)
     writer.close()
 
 
@@ -93,7 +93,7 @@ def ask(address: str, post: bool = False, **headers: str) -> tuple[int, Any]:
         return error.code, error.read()
 
 
-def test_the_page_tells_what_was_measured_of_the_newest_frame(recording, arrivals, tmp_path):
+def test_the_page_shows_what_was_measured_of_the_newest_frame(recording, arrivals, tmp_path):
     with shown(recording, arrivals, tmp_path, 20) as seen:
         look = json.loads(json.dumps(seen.page.look(), allow_nan=False))
     now = list(poses())[19]
@@ -136,7 +136,7 @@ def served(recording, arrivals, tmp_path) -> Iterator[tuple[Shown, str]]:
         server.server_close()
 
 
-def test_others_get_nothing(served):
+def test_requests_without_the_token_get_nothing(served):
     seen, place = served
     base = place.removesuffix(f"{TOKEN}/")
     for path in ("", "look", "wrong/look", f"{TOKEN}/nothing"):
@@ -177,7 +177,7 @@ def test_a_map_is_saved_where_one_is_learnt(served, recording, arrivals, tmp_pat
             seen.page.done(["save"], {})
 
 
-def test_what_the_page_misses_is_counted_and_pictures_are_few(recording, arrivals, tmp_path, monkeypatch):
+def test_poses_that_the_page_misses_are_counted_and_pictures_are_few(recording, arrivals, tmp_path, monkeypatch):
     """More poses than the ring holds before the page looks for the first time."""
     monkeypatch.setattr("sphereorient.live.page.PICTURES_HZ", 1e-3)
     monkeypatch.setattr("sphereorient.live.page.POSES", 16)
@@ -187,7 +187,7 @@ def test_what_the_page_misses_is_counted_and_pictures_are_few(recording, arrival
     assert look["frame"] == 0, "the only picture"
 
 
-def test_before_the_first_frame_the_page_says_so_and_a_port_in_use_is_told(recording, tmp_path):
+def test_before_the_first_frame_the_page_shows_that_and_a_port_in_use_is_refused(recording, tmp_path):
     page = LivePage(recording, tmp_path, Pipe()[1])
     assert page.look() == {"begun": False}
     assert "no frame is measured yet" in page.done(["stop"], {})["said"]
@@ -196,10 +196,10 @@ def test_before_the_first_frame_the_page_says_so_and_a_port_in_use_is_told(recor
 
 
 @pytest.mark.slow  # a process of its own, which imports torch
-def test_a_page_process_that_is_killed_is_told_and_tracking_goes_on(recording, arrivals):
-    told: list[str] = []
+def test_a_page_process_that_is_killed_is_reported_and_tracking_goes_on(recording, arrivals):
+    messages: list[str] = []
     running = Event()
-    page = PageProcess(EXCERPT / "experiment.yaml", None, 0, told.append)
+    page = PageProcess(EXCERPT / "experiment.yaml", None, 0, messages.append)
     try:
         page.begin(recording, running, None)
         folder = page.folder
@@ -207,18 +207,18 @@ def test_a_page_process_that_is_killed_is_told_and_tracking_goes_on(recording, a
         assert json.loads(ask(f"{page.address}look")[1])["frame"] == 0
         assert ask(f"{page.address}stop", post=True)[0] == 200
         page.process.kill()
-        until(lambda: told)
-        assert told == ["page: its process has ended; tracking goes on without the page."]
+        until(lambda: messages)
+        assert messages == ["page: its process has ended; tracking goes on without the page."]
         assert running.is_set(), "else it could not be started again"
         page.saw(arrivals[1], next(poses()))
     finally:
         page.close()
     assert not folder.exists()
-    assert len(told) == 1
+    assert len(messages) == 1
 
 
 @pytest.mark.slow  # a process of its own, which imports torch
-def test_what_is_wrong_with_the_files_is_told_by_the_loop_alone(tmp_path, capfd):
+def test_faults_of_the_files_are_reported_by_the_loop_alone(tmp_path, capfd):
     (tmp_path / "experiment.yaml").write_text((EXCERPT / "experiment.yaml").read_text())  # without movies
     page = PageProcess(tmp_path / "experiment.yaml", None, 0, pytest.fail)
     page.process.join()
@@ -232,7 +232,7 @@ def test_a_person_looks_and_stops(served, browser: Any, tmp_path: Path):
     tab = browser.new_page(viewport={"width": 1280, "height": 800})
     wrong: list[str] = []
     tab.on("pageerror", lambda error: wrong.append(str(error)))
-    tab.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+    tab.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
     tab.on(
         "request", lambda asked: None if asked.url.startswith((f"http://{HOST}", "data:")) else wrong.append(asked.url)
     )

@@ -1,4 +1,4 @@
-"""Which cameras are seen: drivers that answer, hang, fail, end their program; modules stand for them."""
+"""List of cameras: drivers that answer, hang, fail or end their program, as modules in their place."""
 
 import os
 
@@ -58,7 +58,7 @@ def drivers(tmp_path, monkeypatch):
     return install
 
 
-def test_cameras_are_told_as_sources_name_them(drivers, tmp_path, monkeypatch):
+def test_cameras_are_listed_as_sources_name_them(drivers, tmp_path, monkeypatch):
     (tmp_path / "maker.cti").touch()
     monkeypatch.setenv("GENICAM_GENTL64_PATH", os.pathsep.join(["", str(tmp_path)]))
     drivers(harvesters=HARVESTERS, pypylon=PYLON, vmbpy=VIMBA)
@@ -69,7 +69,7 @@ def test_cameras_are_told_as_sources_name_them(drivers, tmp_path, monkeypatch):
     assert found["genicam"] == [f"genicam:{producer}#11 (M)", f"genicam:{producer}#12 (M)"]
 
 
-def test_a_driver_that_hangs_or_ends_its_program_is_told_beside_those_that_answer(drivers):
+def test_a_driver_that_hangs_or_ends_its_program_is_listed_beside_those_that_answer(drivers):
     drivers(pypylon=HANGS, vmbpy=ENDS)
     found = cameras_here(limit_s=1.5)
     assert found["pylon"] == "no answer within 1.5 s"
@@ -77,6 +77,6 @@ def test_a_driver_that_hangs_or_ends_its_program_is_told_beside_those_that_answe
     assert len(found["opencv"]) == 2
 
 
-def test_a_driver_that_fails_is_told_by_its_own_words(drivers):
+def test_a_driver_that_fails_is_reported_in_its_own_words(drivers):
     drivers(vmbpy=FAILS)
     assert cameras_here()["vimba"] == "the driver fails: RuntimeError: no transport layer"

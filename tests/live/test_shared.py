@@ -1,4 +1,4 @@
-"""A ring of poses in memory: read in order by another program, and who is slow sees what it lost."""
+"""A ring of poses in memory: read in order by another program; a slow reader finds which ones it lost."""
 
 import os
 import struct
@@ -52,7 +52,7 @@ def test_a_slot_is_the_pose_as_numbers_in_the_documented_order(tmp_path):
     assert not path.exists()
 
 
-def test_a_reader_that_is_slow_sees_by_the_count_that_it_lost_some(tmp_path):
+def test_a_slow_reader_finds_lost_poses_by_the_count(tmp_path):
     path = tmp_path / "poses"
     with pytest.raises(MovieError, match="expected a ring"):
         next(shared_poses(path))
@@ -77,7 +77,7 @@ def test_a_file_that_is_there_is_not_written_over(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="of POSIX")
-def test_a_disk_without_room_for_a_ring_is_told_before_it_is_written(tmp_path, monkeypatch):
+def test_a_disk_without_room_for_a_ring_is_refused_before_it_is_written(tmp_path, monkeypatch):
     def full(*given: int) -> None:
         raise OSError(28, "No space left on device")
 
@@ -110,12 +110,12 @@ def test_a_ring_in_the_making_does_not_end_the_reading_of_the_one_before(tmp_pat
 
 @pytest.mark.slow  # ten seconds of poses
 def test_ten_thousand_poses_at_1_khz_reach_a_reader_process_in_order(tmp_path):
-    path, said = tmp_path / "poses", tmp_path / "said"
+    path, received = tmp_path / "poses", tmp_path / "received"
     output, _ = open_output(f"shared:{path}", pytest.fail)
     output.send(numbers(0))
-    with said.open("wb") as file:
+    with received.open("wb") as file:
         reader = subprocess.Popen([sys.executable, "-c", READER, str(path)], stdout=file)
-        until(lambda: said.read_text().startswith("begun"), 3 * LIMIT_S)
+        until(lambda: received.read_text().startswith("begun"), 3 * LIMIT_S)
         time.sleep(0.5)
         begun = time.perf_counter()
         for k in range(1, 10_001):
@@ -124,7 +124,7 @@ def test_ten_thousand_poses_at_1_khz_reach_a_reader_process_in_order(tmp_path):
         time.sleep(0.5)
         output.close()
         assert reader.wait(LIMIT_S) == 0
-    lines = [line.split() for line in said.read_text().splitlines()[1:]]
+    lines = [line.split() for line in received.read_text().splitlines()[1:]]
     assert [int(count) for count, *_ in lines] == list(range(10_001))
     assert [int(frame) for _, frame, *_ in lines] == list(range(10_001))
     assert all(float(last) == 32_000.0 + int(frame) for _, frame, _, last in lines)

@@ -1,4 +1,4 @@
-"""Planted disks that the tests of this room share: known to a fraction of a pixel by supersampling."""
+"""Planted disks, shared by the tests of this room: exact to a fraction of a pixel by supersampling."""
 
 from collections.abc import Callable, Sequence
 
@@ -34,7 +34,7 @@ def checker(x: Grey, y: Grey) -> Grey:
 
 
 def blobs(x: Grey, y: Grey) -> Grey:
-    """Waves thresholded to patches of black and white; black is a little brighter than what lies behind."""
+    """Waves thresholded to patches of black and white; black is a little brighter than the background."""
     wave = np.sin(4.1 * x + 1.3 * y) + np.sin(3.7 * y - 2.2 * x + 1) + np.sin(5.3 * x + 4.4 * y - 0.7)
     return np.where(wave > -0.3, WHITE, BLACK + 20).astype(np.float32)
 

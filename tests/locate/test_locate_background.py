@@ -1,4 +1,4 @@
-"""The background: what the movie shows without the ball, how much it scatters, and pictures of it from a file."""
+"""The background: pictures without the ball, their scatter, and backgrounds from a file."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,7 +19,7 @@ SIGMA = 3.0
 
 
 class Pictures:
-    """As much of a movie as learning a background asks for."""
+    """The part of a movie that learning a background needs."""
 
     def __init__(self, frames: np.ndarray) -> None:
         self._frames = frames
@@ -40,7 +40,7 @@ def noisy(count: int, sigma: float = SIGMA, level: float = 500.0, shape: tuple[i
 
 
 def dwelling_ball(count: int = 24) -> np.ndarray:
-    """A ball that wanders about the middle by less than its radius, and leaves for the corner in the last third."""
+    """A ball that wanders about the middle by less than its radius, and moves to the corner in the last third."""
     gradient = np.linspace(-4, 4, SHAPE[1], dtype=np.float32)
     frames = []
     for k in range(count):
@@ -66,7 +66,7 @@ def test_the_mean_is_learnt_without_the_ball_where_it_dwells(dwelling, scene):
     error = np.abs(learnt.mean - scene)
     assert error.max() < 4
     assert np.percentile(error, 99) < 1.5
-    # What makes it worth while: the first measurement sees the ball as a part of the scene.
+    # For comparison: the first measurement takes the ball for a part of the scene.
     first = np.abs(measure_background(dwelling).mean - scene)
     assert first.max() > 30
 
@@ -118,7 +118,7 @@ def test_the_noise_about_a_given_picture_is_its_sigma(sigma):
 
 
 def test_a_pixel_noisier_than_most_keeps_its_own_noise_about_a_given_picture():
-    """The floor is what most pixels do; a flickering third lies above it."""
+    """Most pixels lie at the floor; a flickering third lies above it."""
     frames = noisy(1001, 20.0, level=2000.0)
     away = frames.astype(np.float32) - 16 * 2000.0
     away[:, :, 20:] *= 4
@@ -231,7 +231,7 @@ def test_a_bad_background_is_refused_in_one_line(tmp_path, write, words):
 
 
 def staying(paint: Paint, blur_px: float, count: int = 24) -> np.ndarray:
-    """A ball that stays where it is, and turns by little: its pixels never show the scene."""
+    """A fixed ball that rotates by little: its pixels never show the scene."""
     sights = [
         plant(lambda x, y, turn=0.02 * k: paint(x * np.cos(turn) - y * np.sin(turn), y), 80.0, 75.0, 30.0, SHAPE)
         for k in range(count)
@@ -250,7 +250,7 @@ def test_a_blurred_ball_that_never_leaves_its_place_is_not_taken_for_noise_of_th
     assert np.hypot(found[0].u_px - 80.0, found[0].v_px - 75.0) < 6
 
 
-def test_what_glitters_stays_hidden_also_where_no_ball_is_found():
+def test_glitter_stays_hidden_also_where_no_ball_is_found():
     rng = np.random.default_rng(5)
     frames = np.stack([filmed(np.full(SHAPE, BACK, np.float32), seed=k) for k in range(24)])
     frames[:, 40:100, 60:120] = rng.integers(60, 250, (24, 60, 60))

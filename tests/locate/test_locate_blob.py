@@ -72,7 +72,7 @@ def test_flicker_is_hidden_by_the_noise_there():
 
 
 def test_flicker_of_the_balls_shape_does_not_hide_the_ball():
-    """Brighter than the ball and as round: only the noise map tells it from the ball."""
+    """Brighter than the ball and as round: only the noise map distinguishes it from the ball."""
     ball = plant(blobs, 90.0, 110.0, shape=WIDE)
     fan = plant(lambda x, y: np.full_like(x, 240), 240.0, 110.0, shape=WIDE)
     difference = difference_of(np.maximum(ball, fan))
@@ -81,7 +81,7 @@ def test_flicker_of_the_balls_shape_does_not_hide_the_ball():
     assert np.hypot(best.u_px - 90.0, best.v_px - 110.0) < 8
 
 
-def test_there_are_no_more_blobs_than_asked_for():
+def test_there_are_no_more_blobs_than_the_setting_allows():
     difference = difference_of(plant(white, 110.0, 95.0, shape=WIDE, also=STREAKS))
     assert len(find_blobs(difference, FLAT, DIAMETER, LocateSettings(blob_candidates=1))) == 1
     assert len(find_blobs(difference, FLAT, DIAMETER, LocateSettings(blob_candidates=3))) <= 3

@@ -85,7 +85,7 @@ def test_an_arc_is_less_sure_than_a_whole_rim():
     assert nearest(disks, 318, 100).coverage < nearest(disks, 100, 100).coverage
 
 
-def test_what_something_static_hides_says_nothing():
+def test_pixels_that_something_static_hides_do_not_count():
     mask = np.ones(SHAPE, bool)
     mask[:, 150:] = False
     background = even_background(SHAPE)
@@ -135,7 +135,7 @@ def test_a_disk_that_stands_still_stays_in_the_background():
     assert np.abs(learnt.mean - still.astype(float))[inside].mean() < 3 * NOISE
 
 
-def test_of_one_diameter_in_a_list_the_background_is_that_of_one_ball():
+def test_a_list_of_one_diameter_gives_the_background_of_one_ball():
     frames = np.stack([scene((checker, 30.0 + 15 * k, 45.0, 16.0), shape=SMALL, seed=k) for k in range(9)])
     one, listed = (learn_background(frames, size, SETTINGS) for size in (32.0, (32.0,)))
     assert (one.mean == listed.mean).all()

@@ -46,7 +46,7 @@ def test_a_dark_ball_before_a_bright_wall_is_found():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_an_empty_picture_says_not_found(seed):
+def test_an_empty_picture_has_the_reason_not_found(seed):
     assert find(np.full(WIDE, BACK, np.float32), seed) == (None, Reason.NOT_FOUND)
 
 
@@ -59,7 +59,7 @@ def test_a_disk_of_another_size_is_refused(radius, seed):
     assert reason in (Reason.OUTLINE, Reason.DARK)
 
 
-def test_a_bright_thing_of_another_shape_says_outline():
+def test_a_bright_thing_of_another_shape_has_the_reason_outline():
     def triangle(grey, rows, columns):
         inside = (rows > 90) & (rows - 120 < 40 - 1.6 * np.abs(columns - 150))
         return np.where(inside, np.float32(200), np.float32(BACK))
@@ -68,7 +68,7 @@ def test_a_bright_thing_of_another_shape_says_outline():
 
 
 @pytest.mark.parametrize("above", [4, 5])
-def test_a_ball_hardly_brighter_than_the_scene_says_dark(above):
+def test_a_ball_hardly_brighter_than_the_scene_has_the_reason_dark(above):
     assert find(plant(even(BACK + above), 150.0, 120.0, shape=WIDE), noise=0.7) == (None, Reason.DARK)
 
 
@@ -79,7 +79,7 @@ def test_a_ball_just_bright_enough_is_found():
 
 
 @pytest.mark.parametrize("share", [1.0, 0.7])
-def test_a_ball_mostly_saturated_says_saturated(share):
+def test_a_ball_mostly_saturated_has_the_reason_saturated(share):
     assert find(plant(burnt_out(share), 150.0, 120.0, shape=WIDE)) == (None, Reason.SATURATED)
 
 
@@ -109,7 +109,7 @@ def test_a_ball_that_is_nearly_out_of_the_picture_is_judged_by_what_is_left(u):
     assert distance_px(outline, (u, 120.0)) < 0.6
 
 
-def test_the_share_of_directions_that_is_asked_for_counts():
+def test_the_share_of_directions_of_the_setting_counts():
     def quarter(x, y):
         return np.where((x > 0) & (y > 0), np.float32(170), np.float32(BACK))
 
@@ -120,7 +120,7 @@ def test_the_share_of_directions_that_is_asked_for_counts():
     assert distance_px(outline, (150.0, 120.0)) < 0.5
 
 
-def test_what_was_found_becomes_one_row_a_frame():
+def test_sightings_have_one_row_a_frame():
     outline = Outline(u_px=10.5, v_px=20.25, radius_px=39.0, rms_px=0.2, coverage=0.9)
     seen = sightings_of(iter([(outline, Reason.OK), (None, Reason.DARK)]))
     assert len(seen) == 2

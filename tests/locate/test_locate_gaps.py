@@ -148,7 +148,7 @@ def test_an_outlier_at_either_end_is_replaced():
     assert ((fixed.centre_px - path(noise_px=0.0)).norm(dim=1)[[0, N - 1]] < 2.0).all()
 
 
-def test_an_outlier_beside_a_gap_does_not_bend_what_fills_it():
+def test_an_outlier_beside_a_gap_does_not_change_the_values_in_the_gap():
     fixed = fill_gaps(sightings(without(with_outliers(path(), 62), 60, 61)), SETTINGS)
     assert (fixed.flags[60:62] == INTERPOLATED).all()
     assert fixed.flags[62] == REPLACED

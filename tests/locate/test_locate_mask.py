@@ -1,4 +1,4 @@
-"""Masks: what hides the ball and does not move counts nowhere."""
+"""Masks: pixels of static occluders are not used."""
 
 from dataclasses import replace
 
@@ -84,7 +84,7 @@ def test_a_ball_that_turns_in_its_place_is_found_past_a_mask():
         return held(filmed(plant(lambda x, y: blobs(x + 0.3 * k, y - 0.2 * k), *MIDDLE), k))
 
     frames = np.stack([turned(k) for k in range(12)])
-    flicker = frames.copy()  # what moves before the ball lies under the mask too
+    flicker = frames.copy()  # the moving occluder lies under the mask too
     flicker[::2, in_the_cup()] = 30
     outline, scene = fixed_ball(flicker, SETTINGS, None, shown())
     assert np.hypot(outline.u_px - MIDDLE[0], outline.v_px - MIDDLE[1]) < 1.0

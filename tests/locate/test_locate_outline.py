@@ -1,4 +1,4 @@
-"""The outline: planted disks come back to a fraction of a pixel, whatever is painted on them or stands beside them."""
+"""The outline: planted disks come back to a fraction of a pixel, for any paint and any object beside them."""
 
 import cv2
 import numpy as np
@@ -28,7 +28,7 @@ RADII = [39.0, 36.4]
 
 
 def sectors(count: int, turn: float = 0.0):
-    """White sectors; the others are as dark as what lies behind, so that they and their rim vanish."""
+    """White sectors; the others are as dark as the background, so that they and their rim vanish."""
 
     def paint(x, y):
         number = np.floor((np.arctan2(y, x) + turn) * count / (2 * np.pi))
@@ -85,12 +85,12 @@ def test_the_radius_of_a_ball_dimmer_at_its_rim_is_right(place, radius):
 
 @pytest.mark.parametrize("radius", RADII)
 def test_the_root_of_the_picture_makes_an_evenly_lit_disk_too_large_by_a_known_amount(radius):
-    """The known limit of edges in the root of the picture: it pays for the dim rim of a real ball, above."""
+    """The known limit of edges in the root of the picture, accepted for the dim rim of a real ball, above."""
     outline = outline_of(filmed(plant(white, *PLACES[0], radius)), *PLACES[0])
     assert 0.30 < outline.radius_px - radius < 0.45
 
 
-def test_two_disks_that_differ_by_a_fraction_of_a_pixel_are_told_apart():
+def test_two_disks_that_differ_by_a_fraction_of_a_pixel_are_distinguished():
     radii = np.array([outline_of(filmed(plant(white, *PLACES[0], r)), *PLACES[0]).radius_px for r in (38.0, 38.25)])
     assert abs(np.diff(radii)[0] - 0.25) < 0.03
 
@@ -154,13 +154,13 @@ def test_the_spread_of_half_a_rim_is_that_of_its_geometry():
 
 @pytest.mark.parametrize("paint", [white, blobs])
 @pytest.mark.parametrize("u", [-14.0, -7.0, 0.0, 12.0])
-def test_a_disk_that_the_border_cuts_is_as_wrong_as_its_spread_says(u, paint):
+def test_a_disk_that_the_border_cuts_is_as_wrong_as_its_spread_states(u, paint):
     outline = outline_of(filmed(plant(paint, u, 80.0)), u, 80.0, LocateSettings(coverage_min=0.2))
     error = np.array([outline.u_px - u, outline.v_px - 80.0, outline.radius_px - DIAMETER / 2])
     scale = max(outline.rms_px, 0.2)  # the known error of the radius is no scatter
     assert error @ np.linalg.inv(outline.spread) @ error < 3 * (3 * scale) ** 2
     sigma = np.sqrt(np.diag(outline.spread))
-    assert sigma[0] > 1.5 * sigma[1]  # along the border it is known well
+    assert sigma[0] > 1.5 * sigma[1]  # along the border the error is small
 
 
 def wrinkled(depth, share):
@@ -244,7 +244,7 @@ def test_the_same_picture_gives_the_same_outline():
 
 @pytest.mark.parametrize("colour", [4.0, 40.0, 110.0], ids=["darker", "brighter", "bright"])
 @pytest.mark.parametrize("angle", [0.4, 2.2, 4.0])
-def test_what_passes_before_the_ball_as_round_and_as_large_is_not_taken_for_it(angle, colour):
+def test_a_round_thing_of_the_same_size_that_passes_before_the_ball_is_not_taken_for_it(angle, colour):
     """Its rim is whole, the ball's is not; but nothing is painted on it."""
     place, radius = (99.37, 84.81), DIAMETER / 2
     before = np.array(place) + radius * np.array([np.cos(angle), np.sin(angle)])
@@ -259,7 +259,7 @@ def test_what_passes_before_the_ball_as_round_and_as_large_is_not_taken_for_it(a
 
 
 @pytest.mark.parametrize("wider", [-0.03, 0.0, 0.03])
-def test_a_disk_that_is_wider_than_high_says_by_how_much(wider):
+def test_the_ratio_of_a_disk_that_is_wider_than_high_is_measured(wider):
     u, v = 40.3, 38.7
     picture = plant(white, u, v)
     turn = np.float32([[1 + wider / 2, 0, -u * wider / 2], [0, 1 - wider / 2, v * wider / 2]])

@@ -1,4 +1,4 @@
-"""From outlines to the lab: exact centres give exact places, and the covariance is what noise really does."""
+"""From outlines to the lab: exact centres give exact positions, and the covariance is that of the noise."""
 
 from dataclasses import replace
 
@@ -95,7 +95,7 @@ def parallel() -> Camera:
     return TelecentricCamera(image_size=looking_down().image_size, scale_mm_px=scale, centre_px=middle, **pose)
 
 
-def test_a_telecentric_camera_tells_the_place_beside_another_one_and_none_by_itself():
+def test_a_telecentric_camera_gives_a_position_beside_another_one_and_none_by_itself():
     cameras = {"cam1": looking_along_y(), "cam2": parallel()}
     of_size = exact_radius_px(cameras["cam1"], PLACES), DIAMETER_MM / 2 / 0.23
     seen = {
@@ -113,7 +113,7 @@ def test_a_telecentric_camera_tells_the_place_beside_another_one_and_none_by_its
     assert not none.measured.any()
 
 
-def test_a_sphere_on_the_axis_is_as_far_as_its_limb_says():
+def test_a_sphere_on_the_axis_is_as_far_as_its_limb_gives():
     """By hand: 9 mm at a half angle of asin(9/520), seen with f = 2253.33 px: 39.0058 px, not f 9/520 = 39."""
     camera = looking_along_y()
     seen = {"cam1": sightings(torch.tensor([[324.5, 324.5]]), radius_px=39.005843)}
@@ -172,7 +172,7 @@ def test_where_no_camera_sees_there_is_nothing(count):
 
 
 @pytest.mark.parametrize("flag", [Flag.POSITION_INTERPOLATED, Flag.POSITION_OUTLIER_REPLACED])
-def test_a_frame_that_one_camera_did_not_measure_is_placed_but_not_measured(flag):
+def test_a_frame_that_one_camera_did_not_measure_has_a_position_but_is_not_measured(flag):
     cameras = {"cam1": looking_along_y(), "cam2": looking_down()}
     rms = torch.tensor([0.2, torch.nan, 0.2, 0.2], dtype=torch.float64)
     flags = torch.tensor([0, int(flag), 0, 0])
@@ -212,7 +212,7 @@ def test_the_covariance_of_one_camera_is_that_of_many_noisy_trials(camera, rng):
 
 
 @pytest.mark.parametrize("camera", [looking_along_y(), tilted()])
-def test_a_radius_that_is_wrong_with_its_centre_moves_the_place_as_the_covariance_says(camera, rng):
+def test_a_radius_that_is_wrong_with_its_centre_moves_the_position_as_the_covariance_states(camera, rng):
     """Of half a rim the errors of centre and radius correlate."""
     covariance = 0.04 * torch.tensor([[10.5, 0.0, -6.7], [0.0, 2.0, 0.0], [-6.7, 0.0, 5.3]], dtype=torch.float64)
     place = PLACES[1].expand(2000, 3)
@@ -223,7 +223,7 @@ def test_a_radius_that_is_wrong_with_its_centre_moves_the_place_as_the_covarianc
     agree(found.position_lab_mm, found.covariance_mm2.mean(0))
 
 
-def test_of_two_cameras_the_surer_one_counts_more():
+def test_the_more_certain_of_two_cameras_counts_more():
     """By hand: both see lab x, 9 mm on 39 px; with sigmas of 0.1 and 0.3 px the weights are 9 to 1."""
     cameras = {"cam1": looking_along_y(), "cam2": looking_down()}
     middle = torch.tensor([[324.5, 324.5]], dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Behind a flat wall: the ball's place from one outline, whose rays do not begin in one point."""
+"""Behind a flat wall: the ball's position from one outline, whose rays do not begin in one point."""
 
 import pytest
 import torch

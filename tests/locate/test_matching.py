@@ -31,7 +31,7 @@ def places(count, seed=0):
     return torch.from_numpy(np.random.default_rng(seed).uniform(-30, 30, (count, 3)))
 
 
-def test_all_disks_of_each_ball_are_matched_and_what_meets_by_chance_too():
+def test_all_disks_of_each_ball_are_matched_and_chance_matches_too():
     X = places(5)
     found = {one.chosen for one in match_disks(planted(*X), CAMERAS)}
     assert found >= {
@@ -39,7 +39,7 @@ def test_all_disks_of_each_ball_are_matched_and_what_meets_by_chance_too():
     } - {(-1, -1, -1)}
 
 
-def test_every_match_is_of_sights_that_meet():
+def test_every_match_is_of_lines_of_sight_that_meet():
     X = places(6, seed=1)
     disks = planted(*X)
     for one in match_disks(disks, CAMERAS):
@@ -58,7 +58,7 @@ def test_matches_of_more_cameras_come_first():
     assert number[0] == 3
 
 
-def test_the_own_error_of_a_disk_decides_whether_sights_meet():
+def test_the_own_error_of_a_disk_decides_whether_lines_of_sight_meet():
     X = torch.tensor([5.0, 2.0, -3.0], dtype=torch.float64)
     for sigma, meets in ((1.0, False), (4.0, True)):
         off = Outline(**{**vars(disk(CAMERAS[2], X)), "v_px": disk(CAMERAS[2], X).v_px + 12, "rms_px": sigma})

@@ -34,7 +34,7 @@ QUICK = ["--set", "paint.rounds=4", "--set", "paint.pixels=600", "--set", "paint
 
 
 def unpainted(folder: Path, **changed: object) -> Path:
-    """Render an experiment and take its map away; the map stays beside it as texture.png."""
+    """Render an experiment without `texture:`; the map lies beside it as texture.png."""
     path = write_synthetic_experiment(folder, SynthSettings(**{**SMALL, **changed}))
     rewrite(path, texture=None)
     return path

@@ -44,7 +44,7 @@ def disks_of_pictures(whole: Tensor, detail: float = 0.06, window: float = 0.3) 
 
 
 def turning(count: int, step_deg: float, axis: tuple[float, float, float] = (0.1, 1.0, 0.2)) -> Tensor:
-    """Attitudes (N, 3, 3) of a ball that turns about one axis, the first one not the identity."""
+    """Attitudes (N, 3, 3) of a ball that rotates about one axis, the first one not the identity."""
     unit = torch.nn.functional.normalize(torch.tensor(axis, dtype=torch.float64), dim=0)
     angle = torch.deg2rad(torch.arange(count, dtype=torch.float64) * step_deg)
     start = so3.exp(torch.tensor([0.3, -0.7, 1.1], dtype=torch.float64))
@@ -52,7 +52,7 @@ def turning(count: int, step_deg: float, axis: tuple[float, float, float] = (0.1
 
 
 def turns_on_both_sides(R: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
-    """The constant turns P and Q, (3, 3), with which P R Q is nearest to the truth, where neither frame is known."""
+    """The constant rotations P and Q, (3, 3), for which P R Q is nearest to the truth; both frames are free."""
     P = Q = torch.eye(3, dtype=torch.float64)
     for _ in range(100):
         Q = so3.nearest_rotation(((P @ R).mT @ truth).mean(0))
@@ -61,6 +61,6 @@ def turns_on_both_sides(R: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def error_deg(R: Tensor, truth: Tensor) -> Tensor:
-    """Angles (N,), degrees, the body frame's own turn taken off."""
+    """Angles (N,), degrees, less the rotation of the body frame."""
     Q = so3.nearest_rotation((R.mT @ truth).mean(0))
     return torch.rad2deg(so3.geodesic_distance(R @ Q, truth))

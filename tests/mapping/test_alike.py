@@ -1,4 +1,4 @@
-"""Maps of balls that wear one paint are joined; those of other balls are left."""
+"""Maps of balls with the same paint are joined; maps of other balls stay."""
 
 from types import SimpleNamespace
 
@@ -45,7 +45,7 @@ def maps():
     return paints, of, shared_maps(of, silent)
 
 
-def test_those_of_one_paint_share_a_map_and_its_frame(maps):
+def test_balls_of_one_paint_share_a_map_and_its_frame(maps):
     _, of, shared = maps
     assert [shared[name].first for name in "abc"] == ["a", "b", "a"]
     assert shared["a"].learnt.texture is shared["c"].learnt.texture

@@ -1,4 +1,4 @@
-"""Several balls cut out of movies before there are maps: each by where it is."""
+"""Several balls cut out of movies before there are maps, by their positions."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_a_disk_that_another_one_touches_is_not_used_though_that_one_is_not_seen
     assert touched > 20
 
 
-def test_more_balls_named_than_seen_are_told(seen):
+def test_more_balls_named_than_seen_are_reported(seen):
     instants, scenes, _ = seen
     six = [dict.fromkeys("abcdef", one["a"]) for one in scenes]
     with pytest.raises(PaintError, match="6 balls"):

@@ -23,7 +23,7 @@ def turns_of(R, first, second, bias=None):
 
 
 def drifting(R, bias_deg):
-    """Neighbours' turns, each wrong by the same little turn."""
+    """Neighbours' rotations, each wrong by the same small rotation."""
     first = torch.arange(len(R) - 1)
     return turns_of(R, first, first + 1, [0.0, math.radians(bias_deg), 0.0])
 
@@ -42,7 +42,7 @@ def test_loops_break_a_planted_drift_and_wrong_ones_do_not():
     wrong = turns_of(R, wrong.first, wrong.second, [0.0, 0.9, 0.4])
     closed, left = solve_graph(drifted, RelativeRotations.joined([chain, loops, wrong]), math.radians(1))
     assert error_deg(closed, R).max() < 0.6
-    assert torch.rad2deg(left[-len(wrong) :].norm(dim=-1)).min() > 30  # told apart from the right ones
+    assert torch.rad2deg(left[-len(wrong) :].norm(dim=-1)).min() > 30  # distinguished from the right ones
     alone, _ = solve_graph(drifted, chain, math.radians(1))
     assert error_deg(alone, R).max() > 5
 
@@ -84,7 +84,7 @@ def tumbling(count, step_deg):
 
 @pytest.mark.slow
 def test_a_pattern_of_the_sensor_does_not_pull_turns_towards_zero():
-    """Before: turns 0.80 of the true ones, the chain 7.4 degrees off (median); now 0.96 and 1.7."""
+    """Before: rotations 0.80 of the true ones, the chain 7.4 degrees off (median); now 0.96 and 1.7."""
     R = tumbling(90, 4.0)
     dirt = 60 * torch.randn(SIZE, SIZE, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
     disks = disks_of_pictures(pictures(R, 1, "dots") + dirt)
@@ -99,7 +99,7 @@ def test_a_pattern_of_the_sensor_does_not_pull_turns_towards_zero():
 
 @pytest.mark.parametrize("count", [6, 60])
 def test_paint_alone_is_not_taken_for_a_pattern_of_the_sensor(count):
-    """The plain mean over all instants holds paint: it takes 3 % off the turns of 60 clean pictures."""
+    """The plain mean over all instants holds paint: rotations of 60 clean pictures get 3 % too small."""
     R = tumbling(count, 4.0)
     disks = disks_of_pictures(pictures(R, 2, "dots"))
     taken = (without_static(disks, R).layers - disks.layers)[0, :, 0].square().mean()
@@ -107,10 +107,10 @@ def test_paint_alone_is_not_taken_for_a_pattern_of_the_sensor(count):
 
 
 def refused(whole):
-    with pytest.raises(PaintError) as told:
+    with pytest.raises(PaintError) as caught:
         find_chain(disks_of_pictures(whole), MapSettings())
-    assert "\n" not in str(told.value)
-    return str(told.value)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 def test_a_ball_that_never_turns_is_refused():

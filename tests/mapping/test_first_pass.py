@@ -50,7 +50,7 @@ def paint(normal_body: torch.Tensor) -> torch.Tensor:
 
 
 def picture_of(camera: Camera, R_lab_body: torch.Tensor) -> torch.Tensor:
-    """What a camera sees of that paint, (H, W) float32; 0 beside the ball."""
+    """A camera's picture of that paint, (H, W) float32; 0 beside the ball."""
     width, height = camera.image_size
     v, u = torch.meshgrid(torch.arange(height).double(), torch.arange(width).double(), indexing="ij")
     rays = camera.rays(torch.stack([u, v], dim=-1))
@@ -103,10 +103,10 @@ def test_masked_pixels_show_nothing():
 
 def followed(ball, numbers, place=None) -> list[Poses]:
     follower = FirstPass(place or ball.place)
-    return [follower.next(k / RATE_HZ, [ball.shots[k]])[0] for k in numbers]
+    return [follower.next(k / RATE_HZ, [ball.frames[k]])[0] for k in numbers]
 
 
-def test_the_first_pass_follows_a_ball_of_which_nothing_is_known(ball):
+def test_the_first_pass_follows_a_ball_without_a_map(ball):
     place = replace(ball.place, position_lab_mm=ball.X[:1])
     found = followed(ball, range(70), place)
     R = torch.cat([poses.R_lab_body for poses in found])
@@ -122,26 +122,26 @@ def test_a_jump_is_found_and_another_thing_is_none(ball):
     place = replace(ball.place, position_lab_mm=ball.X[:1])
     follower = FirstPass(place)
     for k in range(5):
-        follower.next(k / RATE_HZ, [ball.shots[k]])
-    shape, background = ball.shots[0].picture.shape, place.views[0].background
+        follower.next(k / RATE_HZ, [ball.frames[k]])
+    shape, background = ball.frames[0].picture.shape, place.views[0].background
     dark = Frame(shown=np.zeros(shape, np.uint8), background=background)
     noise = Frame(shown=np.random.default_rng(0).integers(0, 255, shape).astype(np.uint8), background=background)
     assert follower.next(5 / RATE_HZ, [dark])[0].reason == (Reason.DARK,)
     assert follower.next(6 / RATE_HZ, [noise])[0].reason == (Reason.LOW_SCORE,)
-    again, searched = follower.next(8 / RATE_HZ, [ball.shots[8]])  # 30 degrees on
+    again, searched = follower.next(8 / RATE_HZ, [ball.frames[8]])  # 30 degrees on
     assert searched
     assert supported(again)
     assert float(error_deg(again.R_lab_body, (ball.R[8] @ ball.R[0].mT)[None]).max()) < 1.0
-    assert supported(follower.next(8 / RATE_HZ, [ball.shots[8]])[0])  # a time that stands
+    assert supported(follower.next(8 / RATE_HZ, [ball.frames[8]])[0])  # a time that stands
 
 
 def test_a_ball_that_has_turned_far_unseen_is_found_again(ball):
     follower = FirstPass(replace(ball.place, position_lab_mm=ball.X[:1]))
     for k in range(50):
-        follower.next(k / RATE_HZ, [ball.shots[k]])
+        follower.next(k / RATE_HZ, [ball.frames[k]])
     away = torch.rad2deg(so3.geodesic_distance(ball.R[:50], ball.R[49:50]))
     far = int(away.argmax())
-    again, searched = follower.next(50 / RATE_HZ, [ball.shots[far]])
+    again, searched = follower.next(50 / RATE_HZ, [ball.frames[far]])
     assert searched
     assert float(away[far]) > 60.0
     assert float(so3.geodesic_distance(again.R_lab_body[0], ball.R[far] @ ball.R[0].mT)) < 0.05
@@ -149,8 +149,8 @@ def test_a_ball_that_has_turned_far_unseen_is_found_again(ball):
 
 def kept(ball, place) -> KeptFrames:
     follower, frames = FirstPass(place), KeptFrames(place)
-    for k, shot in enumerate(ball.shots):
-        frames.add([shot], follower.next(k / RATE_HZ, [shot])[0])
+    for k, frame in enumerate(ball.frames):
+        frames.add([frame], follower.next(k / RATE_HZ, [frame])[0])
     return frames
 
 
@@ -173,12 +173,12 @@ def test_frames_that_were_kept_since_an_adjustment_turn_with_it(ball):
     frames = kept(ball, place)
     before, late = frames.so_far(), frames.count
     follower = FirstPass(place)
-    first, _ = follower.next(0.0, [ball.shots[0]])
+    first, _ = follower.next(0.0, [ball.frames[0]])
     far = replace(first, R_lab_body=so3.exp(torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)))
-    frames.add([ball.shots[0]], far)
+    frames.add([ball.frames[0]], far)
     assert (before.count, frames.count) == (late, late + 1)
     R = before.crops()[1]
-    right = [R[0]]  # all turns were 2 % too short
+    right = [R[0]]  # all rotations were 2 % too small
     for one, other in pairwise(R):
         right.append(so3.exp(1.02 * so3.log(other @ one.mT)) @ right[-1])
     expected = so3.exp(1.02 * so3.log(far.R_lab_body[0] @ R[-1].mT)) @ right[-1]
@@ -204,15 +204,15 @@ def test_a_large_ball_is_followed_in_coarser_pixels(ball):
     assert CoarserPictures.of(place).factor == 1
     view = place.views[0]
     twice = 2 * np.array(view.camera.image_size)
-    large = [cv2.resize(shot.picture, twice.tolist(), interpolation=cv2.INTER_NEAREST) for shot in ball.shots[:3]]
+    large = [cv2.resize(frame.picture, twice.tolist(), interpolation=cv2.INTER_NEAREST) for frame in ball.frames[:3]]
     back = CoarserPictures(place=place, whole=place.views, factor=2).frames([Frame(shown=one) for one in large])
-    for one, shot in zip(back, ball.shots, strict=False):
-        np.testing.assert_array_equal(one.picture, shot.picture.astype(np.float32))
+    for one, frame in zip(back, ball.frames, strict=False):
+        np.testing.assert_array_equal(one.picture, frame.picture.astype(np.float32))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("field_deg", [30.0, 60.0])
-def test_a_field_of_view_that_the_pictures_contradict_is_told(tmp_path, field_deg):
+def test_a_field_of_view_that_the_pictures_contradict_is_reported(tmp_path, field_deg):
     path = write_ball_scene(tmp_path / "scene", SCENES["clean_fly"], 120, 1)
     cameras = yaml.safe_load((path.parent / "cameras.yaml").read_text())
     del cameras["cameras"]["cam1"]["f_px"]
@@ -222,12 +222,12 @@ def test_a_field_of_view_that_the_pictures_contradict_is_told(tmp_path, field_de
     if field_deg == 30.0:
         assert remarks == []
     else:
-        (told,) = remarks
-        assert float(re.search(r"about ([0-9.]+) degrees, not 60", told)[1]) == pytest.approx(30.0, rel=0.15)
+        (remark,) = remarks
+        assert float(re.search(r"about ([0-9.]+) degrees, not 60", remark)[1]) == pytest.approx(30.0, rel=0.15)
 
 
 @pytest.mark.slow
-def test_a_ball_far_away_does_not_tell_the_field_of_view(ball):
+def test_a_ball_far_away_does_not_give_the_field_of_view(ball):
     place = replace(ball.place, position_lab_mm=ball.X[:1])
     camera = place.views[0].camera
     pinhole_like = PinholeCamera(
@@ -241,7 +241,7 @@ def test_a_ball_far_away_does_not_tell_the_field_of_view(ball):
     assert focal_ratio(kept(ball, place).adjusted()) == 1.0
 
 
-def test_a_ball_that_flies_has_a_map_from_nothing():
+def test_a_flying_ball_gets_a_map():
     experiment = load_experiment(EXCERPT / "experiment.yaml")
     found, remarks = first_map_of(experiment.with_sphere(texture_path=None), Settings(), None, lambda *_: None)
     assert remarks == []

@@ -153,7 +153,7 @@ def off(found, paint):
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.003, 0.03, 0.3])
 def test_sharpening_is_bounded_by_what_noise_allows(sigma):
-    """The weight that edges of the blurred map tell is near the best one, for any noise."""
+    """The weight found from edges of the blurred map is near the best one, for any noise."""
     paint = random_texture("patches", 5, ROWS).double()
     normal, right = readings(paint, sigma, 6)
     blurred = torch.from_numpy(blur_matrix(EVERYWHERE, BLUR_RAD, ROWS) @ paint.reshape(-1).numpy()).reshape(ROWS, -1)
@@ -172,7 +172,7 @@ def test_noise_does_not_change_paint_that_is_expected():
     tie = paint_tie(paint.float(), BLUR_RAD)
     free, tied = (sharpened(normal, right, BLUR_RAD, tie, known) for known in (torch.zeros(ROWS, 2 * ROWS), paint))
     assert off(tied, paint) < 0.5 * off(free, paint)
-    # What the pictures tell clearly is taken over all the same: expected paint that is turned by a right angle.
+    # Paint that the pictures show clearly replaces even expected paint that is rotated by a right angle.
     normal, right = readings(paint, 0.003, 6)
     turned = sharpened(normal, right, BLUR_RAD, tie, paint.roll(ROWS // 2, 1))
     assert off(turned, paint) < 0.3 * off(paint.roll(ROWS // 2, 1), paint)

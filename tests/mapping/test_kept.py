@@ -1,4 +1,4 @@
-"""An interrupted run of `map` goes on where it was, to the same bytes."""
+"""An interrupted run of `map` resumes, to the same bytes."""
 
 from dataclasses import astuple
 

@@ -43,7 +43,7 @@ def opened(path, cameras=None, frames=None):
 
 
 @pytest.mark.slow
-def test_one_camera_of_the_excerpt_teaches_attitudes_and_leaves_the_unseen_empty():
+def test_one_camera_of_the_excerpt_gives_attitudes_and_leaves_unseen_texels_empty():
     with opened(EXCERPT, ["cam1"]) as recording:
         learnt = mapped(recording, QUICK)
     assert bool(learnt.valid.all())
@@ -51,7 +51,7 @@ def test_one_camera_of_the_excerpt_teaches_attitudes_and_leaves_the_unseen_empty
     assert error.median() < 0.5
     assert learnt.rounds[-1].moved_rad < learnt.rounds[1].moved_rad
     torch.testing.assert_close(learnt.R_lab_body[0], torch.eye(3, dtype=torch.float64))
-    # What never faced the camera is empty, not invented, and the share of it is told.
+    # Paint that never faced the camera stays empty, and its share is reported.
     empty = learnt.seen == 0
     assert 0.02 < float(empty.double().mean()) < 0.7
     assert torch.equal(empty, learnt.texture.isnan())

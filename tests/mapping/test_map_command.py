@@ -26,7 +26,7 @@ from sphereorient.trajectory import Trajectory
 
 
 def refused(monkeypatch, capsys, *arguments: object) -> str:
-    """Run what must be refused, and return the one line."""
+    """Run a command that must be refused, and return its line."""
     code, out, err = run(monkeypatch, capsys, *arguments, "--quiet")
     assert code == 2, out + err
     lines = err.strip().splitlines()
@@ -58,10 +58,10 @@ def attitude_errors_deg(track: Path, experiment: Path) -> np.ndarray:
 def test_a_map_is_learnt_written_and_tracked_with(rendered, tmp_path_factory, monkeypatch, capsys):
     scene = tmp_path_factory.mktemp("learnt")
     out = scene / "learnt.png"
-    code, said, err = run(monkeypatch, capsys, "map", rendered, "--out", out, *QUICK)
+    code, output, err = run(monkeypatch, capsys, "map", rendered, "--out", out, *QUICK)
     assert code == 0, err
     for words in ("seen:", "loops:", "iterations: 4", "correlation", "texture: learnt.png"):
-        assert words in said
+        assert words in output
     texture, seen = load_texture(out), read_seen(seen_path(out))
     assert seen is not None
     assert seen.shape == texture.shape
@@ -73,7 +73,7 @@ def test_a_map_is_learnt_written_and_tracked_with(rendered, tmp_path_factory, mo
         assert np.isnan(file["map/texture"][()]).sum() == (file["map/seen"][()] == 0).sum()
     assert np.percentile(attitude_errors_deg(scene / "learnt_map.h5", rendered), 95) < 1.0
     assert cv2.imread(str(scene / "learnt_map.png")).shape[1] > 500
-    # What `track` makes of it, the pictures anew, frame by frame.
+    # `track` by this map, frame by frame.
     shutil.copytree(rendered.parent, scene / "scene")
     shutil.copy(out, scene / "scene" / "learnt.png")
     rewrite(scene / "scene" / "experiment.yaml", texture="learnt.png")
@@ -89,10 +89,10 @@ def test_an_old_map_is_corrected_and_keeps_its_frame_and_what_is_never_seen(copy
     save_map(warped(true, 1.5), folder / "old.png")
     rewrite(copy, frames=[0, 12])  # too few for all of the ball
     options = ("--init", folder / "old.png", "--out", folder / "new.png", *QUICK)
-    code, said, err = run(monkeypatch, capsys, "map", copy, *options)
+    code, output, err = run(monkeypatch, capsys, "map", copy, *options)
     assert code == 0, err
-    assert "against" in said
-    assert "from the old map" in said
+    assert "against" in output
+    assert "from the old map" in output
     assert (folder / "new_moved.png").is_file()
     new, seen = load_texture(folder / "new.png"), read_seen(folder / "new_seen.png")
     assert seen is not None
@@ -103,7 +103,7 @@ def test_an_old_map_is_corrected_and_keeps_its_frame_and_what_is_never_seen(copy
     against_old, against_true = (compare_maps(known, each) for each in (old, true))
     assert float(so3.angle(against_old.R_other_reference)) < np.deg2rad(0.3)
     assert against_true.rms_rad < 0.6 * against_old.rms_rad
-    # What no picture shows is the old map's, told as never seen.
+    # Paint that no picture shows comes from the old map and counts as unseen.
     assert 0.02 < float((seen == 0).float().mean()) < 0.8
     left = (new - old)[seen == 0].abs()
     assert float(left.median()) < 0.15  # its grey levels are fitted to the new ones
@@ -183,7 +183,7 @@ def test_masks_that_are_none_are_refused(copy, tmp_path, monkeypatch, capsys, ma
     assert words in refused(monkeypatch, capsys, "map", copy, "--out", tmp_path / "map.png")
 
 
-def test_maps_on_disk_say_what_was_never_seen(tmp_path):
+def test_maps_on_disk_mark_unseen_paint(tmp_path):
     texture = torch.tensor([[0.0, 1.0, 0.25, torch.nan]] * 2).repeat(4, 4)
     counts = torch.tensor([[3, 300, 1, 0]] * 2).repeat(4, 4)
     write_texture(texture, tmp_path / "map.png")
@@ -210,12 +210,12 @@ def test_two_maps_are_compared_and_wear_is_drawn(tmp_path, monkeypatch, capsys):
     save_map(paint, tmp_path / "old.png")
     save_map(turned_map(paint, Q.mT), tmp_path / "new.png")
     arguments = ("compare-maps", tmp_path / "new.png", tmp_path / "old.png", "--out", tmp_path / "moved.png")
-    code, said, err = run(monkeypatch, capsys, *arguments, "--json")
+    code, output, err = run(monkeypatch, capsys, *arguments, "--json")
     assert code == 0, err
-    told = json.loads(said)
-    assert np.allclose(told["R_new_old"], Q.numpy(), atol=2e-3)
-    assert told["moved_rms_deg"] < 0.2
-    assert told["changed_share"] < 0.01
+    printed = json.loads(output)
+    assert np.allclose(printed["R_new_old"], Q.numpy(), atol=2e-3)
+    assert printed["moved_rms_deg"] < 0.2
+    assert printed["changed_share"] < 0.01
     assert cv2.imread(str(tmp_path / "moved.png")).shape[1] > 500
     write_seen(torch.zeros(96, 192), tmp_path / "new.png")
-    assert run(monkeypatch, capsys, *arguments)[0] == 2  # nothing known in one of them: nothing to compare
+    assert run(monkeypatch, capsys, *arguments)[0] == 2  # one is all unseen: nothing to compare

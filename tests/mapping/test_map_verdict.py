@@ -1,4 +1,4 @@
-"""What tells that a learnt map is not to be believed: held-out pictures, a fixed ball that wanders, rates that jump."""
+"""Signs of a wrong map: held-out pictures, a fixed ball that wanders, rates that jump."""
 
 import math
 from dataclasses import replace

@@ -18,19 +18,19 @@ def found(disks, first, second):
 
 
 @pytest.mark.parametrize(("cameras", "within_deg"), [(1, 0.6), (2, 0.6)])
-def test_two_renders_tell_how_the_ball_turned_without_a_map(cameras, within_deg):
+def test_two_renders_give_the_rotation_without_a_map(cameras, within_deg):
     R = turning(4, 11.0)
     first, second = torch.tensor([0, 1, 0]), torch.tensor([1, 2, 2])
     turns = found(disks_of_pictures(pictures(R, cameras)), first, second)
     off = so3.geodesic_distance(turns.R_ji, R[second] @ R[first].mT)
     assert torch.rad2deg(off).max() < within_deg
     assert turns.score.min() > 0.9
-    # The other order of the pair is the other turn.
+    # The other order of the pair is the inverse rotation.
     assert so3.geodesic_distance(turns.R_ji.mT, R[second] @ R[first].mT).min() > 0.2
 
 
-def test_what_one_camera_shows_is_found_again_by_the_other():
-    # A quarter turn about lab y carries what camera 1 sees before camera 2.
+def test_paint_that_one_camera_shows_is_found_again_by_the_other():
+    # A quarter turn about lab y moves paint that camera 1 sees before camera 2.
     quarter = so3.exp(torch.tensor([0.0, math.pi / 2, 0.0], dtype=torch.float64))
     start = so3.exp(torch.tensor([0.2, 0.4, -0.3], dtype=torch.float64))
     R = torch.stack([start, quarter @ start])

@@ -1,4 +1,4 @@
-"""Photographs in any order: attitudes from pairs, sets joined, what is left out, what is refused."""
+"""Photographs in any order: attitudes from pairs, joined sets, left-out photographs, refusals."""
 
 import math
 import shutil
@@ -50,7 +50,7 @@ def test_photographs_in_any_order_get_their_attitudes():
     assert chain.rows.tolist() == list(range(12))
     assert error_deg(chain.R_lab_body, R).max() < 5
     torch.testing.assert_close(chain.R_lab_body[0], torch.eye(3, dtype=torch.float64))
-    # Every pair that is kept is right: none is merely the best of a pair without a common patch.
+    # Every kept pair is right: pairs without a common patch are left out.
     assert math.degrees(chain.closure.drift_after_rad) < 5
 
 
@@ -84,7 +84,7 @@ def test_pictures_of_other_paint_are_left_out():
 
 @pytest.mark.slow
 def test_a_wrong_pair_does_not_join_two_sets():
-    """The surest pair between the two halves is put wrong: all their other pairs contradict it."""
+    """The most certain pair between the two halves is made wrong: all other pairs contradict it."""
     R = near_attitudes(8, 8, 30)
     evidence = measured_evidence(disks_of_pictures(pictures(R)), SETTINGS)
     found = all_pairs(evidence.disks)
@@ -130,10 +130,10 @@ def test_views_compared_with_all_others_at_once_rank_rotations_as_pairs_one_by_o
 
 
 def refused(whole):
-    with pytest.raises(PaintError) as told:
+    with pytest.raises(PaintError) as caught:
         found_in(whole)
-    assert "\n" not in str(told.value)
-    return str(told.value)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 def test_too_few_photographs_are_refused():

@@ -1,4 +1,4 @@
-"""Instants that lost their place are found again; a ball in one place, half hidden, of unknown size, is measured."""
+"""Instants without a pose are recovered; a fixed ball, half hidden, of unknown size, is measured."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ from sphereorient.mapping import MapSettings
 from sphereorient.mapping.learn import interpolated, recovered
 from sphereorient.movies import open_movie
 
-# Two turns and a half: over half a turn without a loop nothing tells a ball that is 1 % too large from a shorter turn.
+# Two turns and a half: half a turn without a loop fits a shorter turn as well as a ball that is 1 % too large.
 FRAMES = 120
 QUICK = MapSettings(rounds=6, pixels=600, height=64)
 
@@ -31,8 +31,8 @@ def truth_of(path: Path) -> tuple[torch.Tensor, torch.Tensor]:
         return torch.from_numpy(file["orientation"][()]), torch.from_numpy(file["position"][()])
 
 
-def test_instants_between_are_turned_as_their_neighbours_were():
-    """The chain leans by a drift that grows evenly; two instants are known, the third lies halfway."""
+def test_instants_between_known_ones_follow_their_neighbours():
+    """The chain drifts evenly; two instants are known, the third lies halfway."""
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     true = so3.exp(torch.arange(5, dtype=torch.float64)[:, None] * torch.tensor([0.3, -0.1, 0.2], dtype=torch.float64))
     chain = so3.exp(-0.02 * torch.arange(5, dtype=torch.float64)[:, None] * axis) @ true
@@ -41,7 +41,7 @@ def test_instants_between_are_turned_as_their_neighbours_were():
     assert float(so3.geodesic_distance(found, true).max()) < 1e-9
     ends = interpolated(chain, torch.tensor([1, 3]), true[[1, 3]])
     off = so3.geodesic_distance(ends, true)
-    assert off[[0, 4]].tolist() == pytest.approx([0.02, 0.02], abs=1e-9), "beyond the known ones as the nearest was"
+    assert off[[0, 4]].tolist() == pytest.approx([0.02, 0.02], abs=1e-9), "beyond: the error of the nearest"
 
 
 @pytest.mark.slow
@@ -53,7 +53,7 @@ def test_instants_that_do_not_fit_are_found_again_and_the_others_stay(tmp_path):
     turn = torch.tensor([[0.5, 0.3, -0.2], [-0.4, 0.3, 0.5], [0.1, -0.7, 0.2], [0.6, 0.0, 0.4]], dtype=torch.float64)
     spoilt = state.R_lab_body.clone()
     spoilt[lost] = so3.exp(turn) @ spoilt[lost]
-    # A chain that leans by 3 degrees at the end, in a body frame of its own.
+    # A chain with a drift of 3 degrees at the end, in a body frame of its own.
     lean = torch.linspace(0, math.radians(3), len(R), dtype=torch.float64)[:, None] * torch.tensor([1.0, 0, 0]).double()
     chain = so3.exp(lean) @ R @ so3.exp(torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64))
     found = recovered(crops, replace(state, R_lab_body=spoilt), chain)
@@ -65,7 +65,7 @@ def test_instants_that_do_not_fit_are_found_again_and_the_others_stay(tmp_path):
 
 
 def in_one_place(folder: Path) -> tuple[Path, float]:
-    """One uncalibrated camera, a ball that turns in its place behind a holder; and its distance in radii."""
+    """One uncalibrated camera, a fixed ball behind a holder; and its distance in radii."""
     path = unpainted(folder, **{**SMALL, "velocity_rms": 0.0, "frames": FRAMES, "diameter_px": 60.0, "seed": 3})
     experiment = load_experiment(path)
     camera = experiment.cameras["cam1"]

@@ -1,4 +1,4 @@
-"""A ball that turns in its holder, and sways or sinks there: nothing is known before, and no scene is empty."""
+"""A ball that rotates, sways or sinks in its holder, without a map and without a frame of the empty scene."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -30,7 +30,7 @@ SETTINGS = Settings()
 
 @pytest.fixture(name="scene", scope="module", params=sorted(SCENE))
 def swaying_scene(request, tmp_path_factory):
-    """A small film: its experiment, the ball's place as outlines tell it, and the truth."""
+    """A small movie: its experiment, the ball's position from outlines, and the truth."""
     path = write_ball_scene(tmp_path_factory.mktemp("holder") / request.param, SCENE[request.param], FRAMES, 2)
     with h5py.File(path.with_name("truth.h5")) as file:
         R, X = (torch.from_numpy(file[name][()]) for name in ("orientation", "position"))
@@ -48,14 +48,14 @@ def swaying_scene(request, tmp_path_factory):
 
 
 def off(scene, position_lab_mm, true) -> np.ndarray:
-    """Return by how much places are off, (N, 3): to the right and down, px, and in size, of the radius."""
+    """Return errors of positions, (N, 3): to the right and down, px, and of the size, in radii."""
     view, radius_mm = scene.place.views[0], scene.place.radius_mm
     px = view.camera.project(position_lab_mm) - view.camera.project(true)
     sizes = [view.radius_px(X, radius_mm) for X in (position_lab_mm, true)]
     return torch.cat([px, (sizes[0] / sizes[1] - 1)[:, None]], dim=1).numpy()
 
 
-def test_outlines_tell_the_place_in_each_frame(scene):
+def test_outlines_give_the_position_in_each_frame(scene):
     assert not scene.place.fixed
     away = off(scene, scene.place.position_lab_mm, scene.X)
     assert np.abs(away.mean(0)).max() < 0.6
@@ -84,7 +84,7 @@ def test_places_and_turns_are_adjusted_in_each_frame(scene):
 
 
 @pytest.mark.slow
-def test_it_is_tracked_from_nothing(scene):
+def test_a_swaying_ball_is_tracked_without_a_map(scene):
     row = measure_scene(scene.path, SETTINGS, True)
     assert row.refined is not None
     assert row.refined.found == FRAMES
@@ -101,13 +101,13 @@ def test_a_ball_that_is_taken_as_fixed_is_refused_with_what_to_write(scene):
         held_place(recording, SETTINGS.paint, SETTINGS.locate)
 
 
-def test_init_knows_that_it_sways(scene):
+def test_init_finds_that_the_ball_sways(scene):
     (look,) = look_at([scene.path.with_name("cam1.mkv")])
     assert look.stays
     assert look.sways
 
 
-def test_a_path_without_outliers_is_smoothed_as_much_as_it_asks_for():
+def test_outliers_are_left_out_and_the_path_is_smoothed_by_its_own_noise():
     rng, k = np.random.default_rng(0), np.arange(200)
     true = np.stack([100 + 3 * np.sin(k / 15), 80 + 0.1 * k, 40 + np.cos(k / 25)], axis=1)
     noisy = true + rng.normal(0, 0.3, true.shape)
@@ -118,6 +118,6 @@ def test_a_path_without_outliers_is_smoothed_as_much_as_it_asks_for():
     ]
     path = smoothed(sightings_of(found), LocateSettings())
     off = (np.column_stack([path.centre_px, path.radius_px]) - true)[:199]
-    assert not bool(path.placed[199])  # what lies beyond is not known
+    assert not bool(path.placed[199])  # no outline follows
     assert (off.std(0) < 0.15).all()
     assert np.abs(off[[30, 31, 60, 61, 120]]).max() < 0.4

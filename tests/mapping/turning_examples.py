@@ -25,7 +25,7 @@ def turning_ball(tmp_path_factory):
     experiment = load_experiment(path).with_sphere(fixed=True, texture_path=None)
     with open_recording(experiment, ["cam1"], textured=False) as recording:
         place = held_place(recording, SETTINGS, LocateSettings())
-        shots = list(screened_frames(recording.streams[0], place.views[0].background))
-        for shot in shots:
-            _ = shot.picture
-    return SimpleNamespace(place=place, shots=shots, R=truth(path)[1], X=truth(path)[0])
+        frames = list(screened_frames(recording.streams[0], place.views[0].background))
+        for frame in frames:
+            _ = frame.picture
+    return SimpleNamespace(place=place, frames=frames, R=truth(path)[1], X=truth(path)[0])

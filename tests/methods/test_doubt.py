@@ -1,4 +1,4 @@
-"""What a track says of frames that no other frame confirms, or that the others contradict."""
+"""Flags of frames that no other frame confirms, or that the others contradict."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ TURNED = 20  # frame
 
 
 def tracked(monkeypatch, change, **known):
-    """The excerpt, with its measured poses changed before they are joined, and what is known of its pictures."""
+    """The excerpt, with its measured poses changed before they are joined, and its appearance."""
     joined = precise.join_ball
 
     def changed(job, appearance, table):
@@ -55,7 +55,7 @@ def test_a_frame_alone_in_its_segment_has_the_confidence_of_its_map(monkeypatch,
     assert track.confidence[TURNED] == pytest.approx(expected, abs=1e-3, nan_ok=True)
 
 
-def test_a_track_tells_that_its_score_is_evidence_for_paint(tmp_path):
+def test_a_track_states_that_its_score_is_evidence_for_paint(tmp_path):
     Trajectory.empty(np.arange(3.0), cameras=("a",)).save(tmp_path / "track.h5")
     with h5py.File(tmp_path / "track.h5") as file:
         assert file.attrs["schema"] == "sphereorient-track/1"

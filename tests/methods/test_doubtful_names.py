@@ -6,7 +6,7 @@ from sphereorient.methods.results import with_identity
 from sphereorient.trajectory import Flag, Trajectory
 
 
-def test_a_name_that_is_less_than_sure_is_in_doubt_and_one_that_never_was_is_not():
+def test_a_name_of_low_probability_is_doubtful_and_one_without_probability_is_not():
     certain = np.array([np.nan, 1.0, 0.995, 0.98, 0.5])
     track = Trajectory.empty(np.arange(5) / 600.0)
     track.flags[4] = Flag.SPIKE

@@ -10,7 +10,7 @@ FRAMES = 10
 ALL = [Reason.OK] * FRAMES
 
 
-def told(cam1: list[Reason], cam2: list[Reason]) -> list[str]:
+def remarks_on(cam1: list[Reason], cam2: list[Reason]) -> list[str]:
     track = Trajectory.empty(np.arange(FRAMES) / 600.0, cameras=("cam1", "cam2"))
     reasons = {"cam1": tuple(cam1), "cam2": tuple(cam2)}
     cameras = {name: replace(one, reason=reasons[name]) for name, one in track.cameras.items()}
@@ -19,24 +19,24 @@ def told(cam1: list[Reason], cam2: list[Reason]) -> list[str]:
 
 
 def test_a_camera_that_never_sees_the_ball_is_named_with_the_frames_looked_at():
-    (text,) = told(ALL, [Reason.NOT_FOUND] * 6 + [Reason.OUTLINE] + [Reason.MISSING] * 3)
+    (text,) = remarks_on(ALL, [Reason.NOT_FOUND] * 6 + [Reason.OUTLINE] + [Reason.MISSING] * 3)
     assert text.startswith("cam2: no ball found in 7 frames")
 
 
-def test_a_map_that_fits_no_frame_of_any_camera_is_told_once_with_what_may_look_like_it():
-    (text,) = told([Reason.LOW_SCORE] * FRAMES, [Reason.LOW_SCORE] * 9 + [Reason.OUTLINE])
+def test_a_map_that_fits_no_frame_of_any_camera_is_reported_once_with_what_may_look_like_it():
+    (text,) = remarks_on([Reason.LOW_SCORE] * FRAMES, [Reason.LOW_SCORE] * 9 + [Reason.OUTLINE])
     assert text.startswith("cam1, cam2: no pose of the map")
     assert "another map" in text
 
 
-def test_frames_that_nearly_every_orientation_explains_are_told_with_the_other_method():
-    (text,) = told([Reason.RUNAWAY] * FRAMES, [Reason.RUNAWAY] * FRAMES)
+def test_frames_that_nearly_every_orientation_explains_are_reported_with_the_other_method():
+    (text,) = remarks_on([Reason.RUNAWAY] * FRAMES, [Reason.RUNAWAY] * FRAMES)
     assert text.startswith("cam1, cam2: nearly every orientation")
     assert "precise" in text
 
 
 def test_where_another_camera_measures_the_map_is_not_doubted():
-    (text,) = told(ALL, [Reason.LOW_SCORE] * FRAMES)
+    (text,) = remarks_on(ALL, [Reason.LOW_SCORE] * FRAMES)
     assert "no pose of the map" in text
     assert "another map" not in text
 
@@ -46,5 +46,5 @@ def test_where_another_camera_measures_the_map_is_not_doubted():
     [ALL, [Reason.OK] + [Reason.NOT_FOUND] * 9, [Reason.CONTRADICTS] * FRAMES, [Reason.MISSING] * FRAMES],
     ids=["all", "once", "elsewhere", "no pictures"],
 )
-def test_nothing_is_said_of_a_camera_that_sees_the_ball_or_has_no_pictures(seen):
-    assert told(ALL, seen) == []
+def test_a_camera_that_sees_the_ball_or_has_no_pictures_gets_no_remark(seen):
+    assert remarks_on(ALL, seen) == []

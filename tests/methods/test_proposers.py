@@ -1,4 +1,4 @@
-"""The bank of a search shows what the nearest camera sees."""
+"""The bank of a search shows the view of the nearest camera."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ def camera(f_px: float) -> PinholeCamera:
     )
 
 
-def test_the_nearest_camera_says_from_where_the_ball_is_seen():
+def test_the_nearest_camera_gives_the_distance_of_the_view():
     near, far = camera(184.8), camera(4000.0)  # a rim of 69 px at a focal length of 184.8: 2.86 radii away
     assert as_near(GreySearchSettings(), [(far, 60.0), (near, 138.0)]).distance_radii == pytest.approx(2.86, abs=0.05)
     assert as_near(GreySearchSettings(), [(far, 60.0)]).distance_radii is None

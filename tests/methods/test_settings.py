@@ -71,7 +71,7 @@ def refused(*overrides: str, path: Path | None = None, load=load_settings) -> st
     return text
 
 
-def test_without_a_file_all_is_as_the_rooms_say():
+def test_without_a_file_all_settings_are_the_defaults_of_the_rooms():
     assert load_settings() == Settings()
     assert load_settings().locate == LocateSettings()
     assert list(Settings.model_fields) == ROOMS
@@ -311,7 +311,7 @@ def test_every_key_is_read_by_a_method_and_each_method_accepts_the_defaults():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["precise", "paper"])
-def test_a_method_reads_the_keys_that_it_is_said_to_read_and_no_other(method, monkeypatch):
+def test_a_method_reads_the_keys_that_the_settings_name_for_it_and_no_other(method, monkeypatch):
     """All attributes of settings are noted while the excerpt is tracked."""
     models = {type(part): (branch, set(type(part).model_fields)) for branch, part in Settings()}
     read = set()
@@ -326,10 +326,10 @@ def test_a_method_reads_the_keys_that_it_is_said_to_read_and_no_other(method, mo
         monkeypatch.setattr(model, "__getattribute__", noting)
     excerpt = REPO / "synthetic_data" / "excerpt" / "experiment.yaml"
     run(Request(experiment=excerpt, method=method), MemoryStore())
-    said = {key for key in READERS if is_read(key, method)}
-    assert read - said == set()
+    stated = {key for key in READERS if is_read(key, method)}
+    assert read - stated == set()
     # Not needed by this movie: no checkpoint, no ball that is held in place, no gap in which cameras change places.
-    assert {key for key in said - read if key.partition(".")[0] != "propose"} <= {
+    assert {key for key in stated - read if key.partition(".")[0] != "propose"} <= {
         "locate.background_frames",
         "assemble.repair_margin",
     }
@@ -374,7 +374,7 @@ def test_only_the_cameras_that_were_used_have_fingerprints_and_inputs_elsewhere_
     assert "experiment.yaml" in kept["sha256"]
 
 
-def test_versions_name_what_enters_the_numbers():
+def test_versions_name_all_packages_that_enter_the_numbers():
     found = versions()
     assert {"python", "sphereorient", "torch", "kornia", "numpy"} <= found.keys()
     assert all(isinstance(number, str) and number for number in found.values())

@@ -37,7 +37,7 @@ def quarter_turn(axis: list[float]) -> Tensor:
 # convention
 
 
-def test_omega_lab_of_a_turn_about_lab_z_is_along_lab_z_whatever_the_body_points_at() -> None:
+def test_omega_lab_of_a_rotation_about_lab_z_is_along_lab_z_at_any_orientation() -> None:
     R = spinning([0.0, 0.0, 12.0], quarter_turn([1.0, 0.0, 0.0]))  # body y along lab z
     omega_lab, _ = omega_from_orientations(R, DT, [1, 2])
     assert_close(omega_lab[4], torch.tensor([0.0, 0.0, 12.0], dtype=torch.float64), atol=1e-9)

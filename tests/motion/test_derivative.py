@@ -121,7 +121,7 @@ def test_where_nothing_is_missing_the_gap_aware_stencil_is_the_kernel(order: int
 
 @settings(deadline=None, max_examples=30)
 @given(lost=st.sets(st.integers(0, 40), max_size=14), order=st.sampled_from([0, 1, 2]))
-def test_polynomials_stay_exact_whatever_is_missing(lost: set[int], order: int) -> None:
+def test_polynomials_stay_exact_with_any_frames_missing(lost: set[int], order: int) -> None:
     x, slope = polynomial([3.0, -1.0, 0.5, 0.25][: order + 2], order)
     there = torch.ones(41, dtype=torch.bool)
     there[list(lost)] = False

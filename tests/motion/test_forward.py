@@ -115,14 +115,14 @@ def test_memory_does_not_grow():
     assert len(filtered._transitions) <= 1.5 * TICKS
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_a_jump_begins_the_motion_anew(told):
-    """`told`: the tracker says that the ball was searched for; else the jump contradicts the motion before it."""
+@pytest.mark.parametrize("searched", [True, False])
+def test_a_jump_begins_the_motion_anew(searched):
+    """`searched`: the tracker searched for the ball; else the jump contradicts the motion before it."""
     time_s, sigma = np.arange(300) / 200, np.full(3, 3e-4)
     truth = planted(10.0, 0.05, time_s)
     R = noisy(truth, sigma)
     R[200:] = R[200:] @ so3.exp(torch.tensor([0.3, 0.4, -0.2], dtype=torch.float64)).numpy()
-    value, stated = turning(time_s, R, sigma, (200,) if told else ())
+    value, stated = turning(time_s, R, sigma, (200,) if searched else ())
     unknown = np.flatnonzero(np.isnan(value).any(1))
     assert unknown[FIRST:].tolist() == [200, 201]
     assert 0.7 < over_sigma(value[200:230], stated[200:230], truth.omega_lab_rad_s[200:230]) < 1.4
@@ -138,7 +138,7 @@ def test_time_that_stands_or_goes_back_begins_anew():
     assert unknown[FIRST:].tolist() == [60, 61, 80, 81]
 
 
-def test_noise_that_is_greater_than_stated_is_noticed():
+def test_noise_that_is_greater_than_stated_is_found():
     time_s, sigma = np.arange(600) / 200, np.full(3, 6e-4)
     truth = planted(3.0, 0.1, time_s)
     value, stated = turning(time_s, noisy(truth, sigma), sigma / 2)

@@ -1,4 +1,4 @@
-"""Turns between sets of points, against scipy; what markers can and cannot tell (docs/errata.md E8)."""
+"""Rotations between sets of points, against scipy; what markers can and cannot show (docs/errata.md E8)."""
 
 import pytest
 import torch
@@ -74,9 +74,9 @@ def test_e8_kabsch_gives_the_increment_in_the_lab_so_the_body_components_stay_un
     assert_close(omega, omega_from_orientations(R, DT, [1, 2])[0], atol=1e-6)
     omega_true = torch.tensor([3.0, -5.0, 9.0], dtype=torch.float64)
     assert_close(omega[5], omega_true, atol=1e-6)
-    printed = to_body(R[5], omega_true)  # what it would be if it were the particle's
+    printed = to_body(R[5], omega_true)  # the wrong reading: in particle components
     assert (omega[5] - printed).norm() > 5
-    # two bodies with the same markers but other body axes look alike: nothing tells omega_body
+    # two bodies with the same markers but other body axes look alike: omega_body is unknown
     assert (to_body(R[5] @ R[2], omega[5]) - printed).norm() > 1
 
 

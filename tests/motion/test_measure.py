@@ -35,7 +35,7 @@ def rel_rms(got: Tensor, true: Tensor) -> tuple[float, float]:
 # convention: units and frames by hand
 
 
-def test_units_are_si_and_frames_are_what_their_names_say() -> None:
+def test_units_are_si_and_frames_are_those_of_the_names() -> None:
     motion = measure_motion(*steady(60), RATE, MotionSettings())
     t = 30 / RATE
     by_hand = {

@@ -1,4 +1,4 @@
-"""The smoother on planted motion: figures, honest sigmas, gaps, ends, fast turns, wrong frames, laws."""
+"""The smoother on planted motion: figures, sigmas, gaps, ends, fast rotation, wrong frames, laws."""
 
 import math
 from dataclasses import fields, replace
@@ -115,7 +115,7 @@ def test_the_motion_of_the_experiment_is_recovered_as_a_plain_gaussian_process_d
 
 
 @pytest.mark.parametrize("omega_rms", [slow(10.5), slow(145.0), 292.0], ids=["2 deg", "22 deg", "45 deg a frame"])
-def test_every_sigma_is_honest_whatever_the_turn_between_frames(omega_rms: float, rng: torch.Generator) -> None:
+def test_every_sigma_is_that_of_its_errors_for_any_rotation_rate(omega_rms: float, rng: torch.Generator) -> None:
     truth = planted(omega_rms)
     result = smoothed(truth, *measured(truth, rng))
     assert 0.7 < over_sigma(turn_off(truth, result), result.orientation_cov_rad2) < 1.4
@@ -145,7 +145,7 @@ def test_slow_errors_are_covered_by_the_share_that_is_set_aside_for_them(rng: to
     settings = SmoothSettings(slow_share=share)
     found = [smoothed(truth, position, R, settings=s) for s in (settings, WHITE)]
     honest, bold = (over_sigma(truth.position_lab_mm - x.position_lab_mm, x.position_cov_mm2) for x in found)
-    assert 0.6 < honest < 1.4  # somewhat timid: the learnt factor holds part of the slow errors already
+    assert 0.6 < honest < 1.4  # somewhat too large: the learnt factor holds part of the slow errors already
     assert bold > 1.4
     assert torch.equal(found[0].position_lab_mm, found[1].position_lab_mm)
 
@@ -157,7 +157,7 @@ def test_slow_errors_are_covered_by_the_share_that_is_set_aside_for_them(rng: to
 @pytest.mark.parametrize(
     ("omega_rms", "lost"), [slow(10.5, (60, 80)), slow(22.0, (60, 72)), (292.0, (60, 72))], ids=str
 )
-def test_a_gap_is_bridged_with_sigmas_that_say_how_well(
+def test_a_gap_is_bridged_with_the_sigmas_of_its_errors(
     omega_rms: float, lost: tuple[int, int], rng: torch.Generator
 ) -> None:
     truth = planted(omega_rms)
@@ -291,7 +291,7 @@ def test_time_backwards_turns_rates_around(rng: torch.Generator) -> None:
 
 
 @pytest.mark.slow
-def test_segments_know_nothing_of_each_other(rng: torch.Generator) -> None:
+def test_segments_do_not_depend_on_each_other(rng: torch.Generator) -> None:
     truth = planted()
     position, R = measured(truth, rng)
     segment = torch.zeros(len(R), dtype=torch.long)
@@ -303,7 +303,7 @@ def test_segments_know_nothing_of_each_other(rng: torch.Generator) -> None:
     for entry in fields(Smoothed):
         values = getattr(one, entry.name)
         if isinstance(values, Tensor) and values.is_floating_point():
-            if "given_path" not in entry.name:  # a frame outside all segments keeps what it measured
+            if "given_path" not in entry.name:  # a frame outside all segments keeps its measurement
                 assert values[85:90].isnan().all(), entry.name
             assert values[:85].isfinite().all(), entry.name
             # the factor on the sigmas is learnt from all segments, the motion of each from itself
@@ -392,9 +392,9 @@ def test_a_slow_share_adds_its_part_of_the_measured_variance_to_the_covariances_
     assert_close(with_slow.velocity_sigma_m_s, without.velocity_sigma_m_s)
 
 
-# what the path of positions says of orientations
+# orientations given the path of positions
 
-SHARED_PART = 0.9  # correlation of the errors of turn and place along each axis
+SHARED_PART = 0.9  # correlation of the errors of orientation and position along each axis
 
 
 def coupled(truth: Motion6D, rng: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
@@ -407,24 +407,24 @@ def coupled(truth: Motion6D, rng: torch.Generator) -> tuple[Tensor, Tensor, Tens
     return truth.position_lab_mm - POSITION_MM * place, so3.exp(-turn) @ truth.R_lab_body, coupling
 
 
-def test_orientations_are_better_where_the_path_tells_the_error_of_the_position(rng: torch.Generator) -> None:
+def test_orientations_are_better_where_the_path_shows_the_error_of_the_position(rng: torch.Generator) -> None:
     truth = planted()
     X, R, coupling = coupled(truth, rng)
-    alone, told = (smoothed(truth, X, R, coupling=each) for each in (None, coupling))
+    alone, linked = (smoothed(truth, X, R, coupling=each) for each in (None, coupling))
     assert torch.equal(alone.R_given_path, R)
-    assert torch.equal(told.position_lab_mm, alone.position_lab_mm)
-    rms = [float(so3.log(truth.R_lab_body @ x.R_given_path.mT).square().mean().sqrt()) for x in (alone, told)]
+    assert torch.equal(linked.position_lab_mm, alone.position_lab_mm)
+    rms = [float(so3.log(truth.R_lab_body @ x.R_given_path.mT).square().mean().sqrt()) for x in (alone, linked)]
     # Of the shared error the part remains that the smoothed positions have.
-    left = float((told.position_lab_mm - truth.position_lab_mm).square().mean().sqrt()) / POSITION_MM
+    left = float((linked.position_lab_mm - truth.position_lab_mm).square().mean().sqrt()) / POSITION_MM
     expected = math.hypot(SHARED_PART * left, math.sqrt(1 - SHARED_PART**2)) * ORIENTATION_RAD
     assert rms[1] == pytest.approx(expected, rel=0.1)
     assert rms[1] < 0.8 * rms[0]
-    assert 0.85 < over_sigma(so3.log(truth.R_lab_body @ told.R_given_path.mT), told.cov_given_path_rad2) < 1.15
-    own = (1 - SHARED_PART**2) * (ORIENTATION_RAD * told.orientation_scale) ** 2 * torch.eye(3, dtype=torch.float64)
-    by_path = (SHARED_PART * ORIENTATION_RAD / POSITION_MM) ** 2 * told.position_cov_mm2
-    assert_close(told.cov_given_path_rad2, own + by_path, 1e-9 * ORIENTATION_RAD**2)
-    assert 0.8 < over_sigma(turn_off(truth, told), told.orientation_cov_rad2) < 1.25
-    smooth = [float(turn_off(truth, x).square().mean()) for x in (told, alone)]
+    assert 0.85 < over_sigma(so3.log(truth.R_lab_body @ linked.R_given_path.mT), linked.cov_given_path_rad2) < 1.15
+    own = (1 - SHARED_PART**2) * (ORIENTATION_RAD * linked.orientation_scale) ** 2 * torch.eye(3, dtype=torch.float64)
+    by_path = (SHARED_PART * ORIENTATION_RAD / POSITION_MM) ** 2 * linked.position_cov_mm2
+    assert_close(linked.cov_given_path_rad2, own + by_path, 1e-9 * ORIENTATION_RAD**2)
+    assert 0.8 < over_sigma(turn_off(truth, linked), linked.orientation_cov_rad2) < 1.25
+    smooth = [float(turn_off(truth, x).square().mean()) for x in (linked, alone)]
     assert smooth[0] < smooth[1]
 
 
@@ -432,9 +432,9 @@ def test_a_frame_whose_position_contradicts_the_path_keeps_its_orientation(rng: 
     truth = planted()
     X, R, coupling = coupled(truth, rng)
     X[50] += 20 * POSITION_MM
-    told = smoothed(truth, X, R, coupling=coupling)
-    assert torch.equal(told.R_given_path[50], R[50])
-    assert not torch.equal(told.R_given_path[51], R[51])
+    linked = smoothed(truth, X, R, coupling=coupling)
+    assert torch.equal(linked.R_given_path[50], R[50])
+    assert not torch.equal(linked.R_given_path[51], R[51])
 
 
 def test_the_share_of_errors_that_last_is_found_in_the_disagreement_of_cameras(rng: torch.Generator) -> None:
@@ -448,7 +448,7 @@ def test_the_share_of_errors_that_last_is_found_in_the_disagreement_of_cameras(r
         assert lasting_share(apart, cov, segment, 0.0) == pytest.approx(share, abs=0.12)
     assert lasting_share(white, cov, segment, 0.25) == 0.25  # never less than is assumed
     assert lasting_share(slow[:, :0], cov[:, :0], segment, 0.25) == 0.25  # a single camera
-    assert lasting_share(slow[:4], cov[:4], segment[:4], 0.25) < 0.35  # a few frames tell little
+    assert lasting_share(slow[:4], cov[:4], segment[:4], 0.25) < 0.35  # a few frames give little
     cov = cov.clone()
     cov[7] = 0.0  # a picture with few pixels left
     assert lasting_share(white, cov, segment, 0.25) == 0.25

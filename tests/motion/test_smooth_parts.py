@@ -112,7 +112,7 @@ def test_filter_and_smoother_agree_with_dense_least_squares(hidden: tuple[int, .
         np.testing.assert_allclose(result.covariance[k], covariance[part, part], atol=1e-8)
     assert filtered.misfit == pytest.approx(off @ np.linalg.solve(S, off))
     assert filtered.log_determinant == pytest.approx(np.linalg.slogdet(S)[1])
-    # the mahalanobis of one measurement is its distance from what all others say
+    # the mahalanobis of one measurement is its distance from the estimate of all others
     others, doubt, _, _ = believed(np.flatnonzero(used & (np.arange(count) != 6)))
     away = chain.measured[6] - others[6 * size : 6 * size + 3]
     whole = doubt[6 * size : 6 * size + 3, 6 * size : 6 * size + 3] + chain.covariance[6]

@@ -22,7 +22,7 @@ class Bytes(bytearray):
 
 @dataclass
 class Cine:
-    """What to write; the defaults are a plain recording whose rows are stored bottom-up."""
+    """Content of the file; the defaults are a plain recording whose rows are stored bottom-up."""
 
     frames: NDArray[Any]  # (N, H, W) or (N, H, W, 3) in R, G, B, as they are to be seen
     first_number: int = 0
@@ -38,7 +38,7 @@ class Cine:
     blocks_after: Sequence[tuple[int, bytes]] = ()
     setup_length: int = SETUP_LENGTH
     real_bits: int = 0
-    compression: int = 0  # what the header says: 1: JPEG, 2: raw colours of a filter array
+    compression: int = 0  # of the header: 1: JPEG, 2: raw colours of a filter array
     packed_bits: int = 0  # 10 or 12
     gap: int = 0  # bytes between images that belong to none
     rotate: int = 0
@@ -101,7 +101,7 @@ def write_cine(path: Path, cine: Cine) -> Path:
 
 
 def image_bytes(cine: Cine, picture: NDArray[Any]) -> bytes:
-    """Return one image as it is stored: rows turned round by the rule, colours as B, G, R, bits packed."""
+    """Return one image as it is stored: rows reversed by the rule, colours as B, G, R, bits packed."""
     if cine.flip_h:
         picture = picture[:, ::-1]
     bottom_up = (cine.flip_v == 0) != bool(cine.packed_bits)

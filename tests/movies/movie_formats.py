@@ -48,7 +48,7 @@ def white_is_zero(folder: Path, frames: Frames) -> Path:
 
 
 def turned_tiff(orientation: int, turn: Callable[[Frames], Frames]) -> Writer:
-    """TIFF whose rows or columns begin elsewhere, which its tag tells."""
+    """TIFF whose orientation tag names another first row or column."""
     return lambda folder, frames: tiff(extratags=[(274, 3, 1, orientation, True)])(folder, turn(frames))
 
 

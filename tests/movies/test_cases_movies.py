@@ -1,4 +1,4 @@
-"""Files that people asked about in public: containers and units (../shared/cases, each with its README)."""
+"""Files from public questions: containers and units (../shared/cases, each with its README)."""
 
 import math
 import re
@@ -31,7 +31,7 @@ def remarks(movie, word: str) -> list[str]:
 
 
 def middle(movie, level: int = 60) -> tuple[float, float]:
-    """The middle (u, v) of what differs from the border, px: the ball's."""
+    """The middle (u, v), px, of the pixels that differ from the border: the ball's."""
     picture = movie.sample([0])[0].astype(float)
     v, u = np.nonzero(abs(picture - np.median(picture[:3])) > level)
     return (u.min() + u.max()) / 2, (v.min() + v.max()) / 2
@@ -43,7 +43,7 @@ def test_a_movie_that_was_cut_without_encoding_is_whole():
     assert not remarks(movie, "truncated")
 
 
-def test_an_interlaced_movie_says_what_to_do():
+def test_an_interlaced_movie_gets_a_remark_with_advice():
     assert remarks(open_movie(CASES / "interlaced" / "interlaced.mp4"), "interlaced")
 
 
@@ -59,7 +59,7 @@ def test_a_phones_time_stamps_are_its_times(name, tick_s):
 @pytest.mark.parametrize("name", ["matlab73.h5", "matlab73.mat", "h5create.h5"])
 def test_matlabs_pictures_are_upright(name):
     movie = open_movie(CASES / "matlab_hdf5" / name)
-    if name == "h5create.h5":  # nothing marks it: it says so
+    if name == "h5create.h5":  # without a mark: remarked
         assert remarks(movie, "flip: transpose")
         movie = flipped(movie, "transpose")
     assert movie.frame_shape == (160, 200)
@@ -69,23 +69,23 @@ def test_matlabs_pictures_are_upright(name):
 @pytest.mark.parametrize("name", ["nhwc.h5", "nhwc.npy", "nchw.h5"])
 def test_a_fourth_axis_of_one_channel_is_read(name):
     movie = open_movie(CASES / "hdf5_four_axes" / name)
-    movie = flipped(movie, "transpose") if name == "nchw.h5" else movie  # (N, 1, W, H), which it says
+    movie = flipped(movie, "transpose") if name == "nchw.h5" else movie  # (N, 1, W, H), as marked
     assert (len(movie), movie.frame_shape) == (24, (160, 200))
     assert middle(movie) == pytest.approx((120, 70), abs=1.5)
 
 
-def test_a_file_of_labels_asks_for_the_movie():
+def test_a_file_of_labels_is_refused_with_a_hint_to_the_movie():
     with pytest.raises(MovieError, match="labelled"):
         open_movie(CASES / "hdf5_four_axes" / "pkg.slp")
 
 
-def test_the_rotation_tag_is_said():
+def test_the_rotation_tag_is_remarked_upon():
     for name, turn in (("rot180.mp4", 180), ("rot90.mp4", 270)):
         assert remarks(open_movie(CASES / "rotation_tag" / name), f"{turn} degrees clockwise")
 
 
 @pytest.mark.parametrize("unit", ["ms", *(pytest.param(unit, marks=pytest.mark.slow) for unit in ("us", "ns"))])
-def test_units_that_no_file_states_are_asked_for(tmp_path, monkeypatch, capsys, unit):
+def test_units_that_no_file_states_are_refused(tmp_path, monkeypatch, capsys, unit):
     for name in (f"{unit}.h5", "texture.png"):
         (tmp_path / name).symlink_to(CASES / "time_units" / name)
     monkeypatch.chdir(tmp_path)
@@ -115,7 +115,7 @@ def test_convert_keeps_a_phones_time_stamps_beside_the_movie(tmp_path, monkeypat
     assert load_times(tmp_path / "out.times.csv") == pytest.approx(times_s, abs=1e-12)
 
 
-def test_convert_leaves_out_times_whose_unit_nobody_knows(tmp_path, monkeypatch, capsys):
+def test_convert_leaves_out_times_of_unknown_unit(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     code, out, _ = run(monkeypatch, capsys, "convert", str(CASES / "time_units" / "ms.h5"), "out.h5")
     assert code == 0

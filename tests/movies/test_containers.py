@@ -1,4 +1,4 @@
-"""What containers say beside the pictures: time stamps, edit lists, fields, axes, parts; files of other programs."""
+"""Metadata of containers: time stamps, edit lists, fields, axes, parts; files of other programs."""
 
 from fractions import Fraction
 from pathlib import Path
@@ -39,12 +39,12 @@ def remark(movie: Any, word: str) -> list[str]:
 
 
 @pytest.mark.parametrize(("suffix", "codec", "tick_s"), [(".mkv", "ffv1", 1e-3), (".mp4", "mpeg4", 1 / 65000)])
-def test_uneven_time_stamps_are_the_movies_times_and_are_said(tmp_path, suffix, codec, tick_s):
+def test_uneven_time_stamps_are_the_movies_times_with_a_remark(tmp_path, suffix, codec, tick_s):
     movie = open_movie(stamped(tmp_path / f"movie{suffix}", JITTER_S, codec))
     assert movie.times_s == pytest.approx(JITTER_S, abs=0.51 * tick_s)
-    (said,) = remark(movie, "not even")
-    assert "after frame 5" in said
-    assert f"{1e3 * tick_s:.3g} ms" in said
+    (line,) = remark(movie, "not even")
+    assert "after frame 5" in line
+    assert f"{1e3 * tick_s:.3g} ms" in line
     assert not remark(movie, "truncated")
     assert movie.sample([7])[0].shape == (38, 52)
 
@@ -68,7 +68,7 @@ def test_uneven_stamps_that_are_rounded_too_coarsely_are_no_times(tmp_path):
 @pytest.mark.parametrize(
     "times_s", [JITTER_S, np.arange(12) / 30, 7 + np.arange(12) / 30], ids=["uneven", "even", "late"]
 )
-def test_a_cut_off_matroska_is_truncated_whatever_its_stamps(tmp_path, times_s):
+def test_a_cut_off_matroska_is_truncated_with_any_stamps(tmp_path, times_s):
     path = stamped(tmp_path / "movie.mkv", times_s)
     assert not remark(open_movie(path), "truncated")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -120,7 +120,7 @@ def test_interlaced_frames_are_to_be_parted_first(tmp_path, interlaced):
 
 @pytest.mark.parametrize("chunks", [None, (4, 37, 51), (7, 20, 20)])
 @pytest.mark.parametrize("suffix", [".h5", ".mat"])
-def test_what_matlab_saved_has_rows_and_columns_as_there(tmp_path, suffix, chunks):
+def test_movies_of_matlab_have_its_rows_and_columns(tmp_path, suffix, chunks):
     """MATLAB saves H x W x N as (N, W, H)."""
     frames = pictures()
     with h5py.File(tmp_path / f"movie{suffix}", "w", userblock_size=512) as file:
@@ -132,13 +132,13 @@ def test_what_matlab_saved_has_rows_and_columns_as_there(tmp_path, suffix, chunk
     assert movie.times_s == pytest.approx(np.arange(30) / 100)
 
 
-def test_a_mat_file_of_an_older_version_says_how_to_save_it(tmp_path):
+def test_a_mat_file_of_an_older_version_is_refused_with_advice(tmp_path):
     (tmp_path / "movie.mat").write_bytes(b"MATLAB 5.0 MAT-file, Platform: GLNXA64".ljust(400, b"\0"))
     with pytest.raises(MovieError, match=r"-v7\.3"):
         open_movie(tmp_path / "movie.mat")
 
 
-def test_a_transposed_movie_says_so_where_nothing_marks_it_and_flip_turns_it_back(tmp_path):
+def test_a_transposed_movie_is_reported_where_nothing_marks_it_and_flip_undoes_it(tmp_path):
     frames = pictures()
     with h5py.File(tmp_path / "movie.h5", "w") as file:
         file["mov"] = frames.swapaxes(1, 2)
@@ -200,7 +200,7 @@ def test_ome_parts_and_channels_are_refused_and_one_of_each_is_read(tmp_path):
         open_movie(path)
 
 
-def test_a_cut_off_ome_movie_gives_its_pages_and_says_so(tmp_path):
+def test_a_cut_off_ome_movie_gives_its_pages_with_a_remark(tmp_path):
     pixels = (
         '<Pixels ID="P:0" DimensionOrder="XYZCT" Type="uint8" SizeX="51" SizeY="37" SizeZ="1" SizeC="1" SizeT="30"/>'
     )

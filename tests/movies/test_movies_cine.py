@@ -1,4 +1,4 @@
-"""Phantom's .cine, written by the tests' own writer: pixels, row order, cropping, times, and what is refused."""
+"""Phantom's .cine, written by the tests' own writer: pixels, row order, cropping, times, and refusals."""
 
 import av
 import numpy as np
@@ -9,7 +9,7 @@ from movie_examples import FRAMES, pictures
 from sphereorient.errors import MovieError
 from sphereorient.movies import open_movie
 
-WIDE = (FRAMES, 37, 52)  # whole groups of packed pixels, as FFmpeg wants them
+WIDE = (FRAMES, 37, 52)  # whole groups of packed pixels, as FFmpeg needs them
 
 
 def deep(bits: int, shape: tuple[int, int, int] = (FRAMES, 37, 51)) -> np.ndarray:
@@ -95,7 +95,7 @@ def test_stamps_that_stand_still_are_not_used(tmp_path):
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_what_the_header_asks_for_is_remarked_upon(tmp_path, cine, word):
+def test_processing_that_the_header_requests_is_remarked_upon(tmp_path, cine, word):
     movie = open_movie(write_cine(tmp_path / "movie.cine", cine))
     assert any(word in remark for remark in movie.remarks)
 

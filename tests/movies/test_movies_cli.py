@@ -40,7 +40,7 @@ def test_a_spread_of_frames_covers_first_and_last_and_finds_repeats(tmp_path):
     assert seen.faults["repeated"] == tuple(number for number in numbers if number % 2)
 
 
-def test_movie_tells_what_is_in_a_file_and_draws_it(tmp_path, monkeypatch, capsys):
+def test_movie_prints_what_is_in_a_file_and_draws_it(tmp_path, monkeypatch, capsys):
     path, _, _ = faulty(tmp_path)
     monkeypatch.chdir(tmp_path)
     code, out, _ = run(monkeypatch, capsys, "movie", path, "--all", "--quiet")

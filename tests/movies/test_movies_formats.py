@@ -121,7 +121,7 @@ def test_a_lossless_grey_movie_needs_no_remark(tmp_path):
         assert open_movie(LOSSLESS[name](tmp_path / name, pictures())).remarks == ()
 
 
-def test_the_files_of_a_movie_are_told(tmp_path):
+def test_the_files_of_a_movie_are_reported(tmp_path):
     folder = LOSSLESS["png"](tmp_path, pictures())
     assert len(movie_files(folder)) == FRAMES
     assert len(movie_files(folder / "cam1_1*.png")) == 10

@@ -1,4 +1,4 @@
-"""From a decoded frame to grey values, where files are hard to come by."""
+"""From a decoded frame to grey values, for formats without sample files."""
 
 import av
 import numpy as np

@@ -1,4 +1,4 @@
-"""What headers claim; `tests/hostile` has movies cut off or with bytes changed anywhere."""
+"""False claims of headers; `tests/hostile` has movies cut off or with bytes changed anywhere."""
 
 import tracemalloc
 from itertools import islice
@@ -17,11 +17,11 @@ MOST_BYTES = 64 << 20
 
 
 def check(path: Path) -> None:
-    """Read a movie as far as it goes; nothing but one line that names it may come instead."""
+    """Read a movie as far as possible; a refusal must be one line that names it."""
     refusal = ""
     try:
         movie = open_movie(path)
-        assert 0 < len(movie) <= 5000  # a file of 12 frames may claim what it likes
+        assert 0 < len(movie) <= 5000  # the claim of a file of 12 frames
         for frame in islice(movie.readable(), 40):
             assert frame is None or (frame.shape, frame.dtype) == (movie.frame_shape, movie.dtype)
         movie.sample([len(movie) - 1, 0])

@@ -91,7 +91,7 @@ def test_only_slices_that_hold_the_part_are_decoded_here_and_ahead_in_the_next_f
         assert decoded[2:] == [[1]]
 
 
-def test_a_part_may_be_asked_for_after_the_pool_has_closed(tmp_path: Path) -> None:
+def test_a_part_may_be_read_after_the_pool_has_closed(tmp_path: Path) -> None:
     expected = pictures(count=2)
     path = written(tmp_path / "m.mkv", expected, slices="9")
     with ThreadPoolExecutor(2) as pool:
@@ -158,7 +158,7 @@ def test_a_stub_is_a_slice_whose_check_sum_is_right(first: bool) -> None:
 
 
 @pytest.mark.parametrize("slices", ["4", "6", "24"])
-def test_a_bright_ball_on_black_tells_the_slices_apart(tmp_path: Path, slices: str) -> None:
+def test_a_bright_ball_on_black_shows_where_the_slices_are(tmp_path: Path, slices: str) -> None:
     expected = pictures()
     expected[0][:] = 0
     expected[0][50:90, 60:100] = 200  # the others are bright everywhere

@@ -99,7 +99,7 @@ def test_two_readers_of_one_movie_do_not_disturb_each_other(tmp_path):
 
 @pytest.mark.parametrize("frame_rate_hz", [29.97, 600.0, 7000.0])  # stamps of MKV count ms: at 7 kHz they repeat
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_what_write_ffv1_writes_comes_back(tmp_path, dtype, frame_rate_hz):
+def test_frames_of_write_ffv1_come_back(tmp_path, dtype, frame_rate_hz):
     frames = pictures(dtype)
     assert write_ffv1(tmp_path / "movie.mkv", iter(frames), frame_rate_hz) == FRAMES
     with open_movie(tmp_path / "movie.mkv") as movie:

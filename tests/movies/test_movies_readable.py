@@ -1,4 +1,4 @@
-"""Reading on after damage: what is lost is None, what is left is as it was, and keeps its number."""
+"""Reading on after damage: lost frames are None, the others are unchanged and keep their numbers."""
 
 from fractions import Fraction
 
@@ -29,7 +29,7 @@ def damage(path, numbers) -> None:
 
 
 def blank(path, number) -> None:
-    """Overwrite all of a packet: codecs without check sums do not notice less."""
+    """Overwrite all of a packet: codecs without check sums do not detect less."""
     content = bytearray(path.read_bytes())
     at, size = packet_places(path)[number]
     content[at : at + size] = bytes(size)
@@ -53,7 +53,7 @@ def test_a_damaged_frame_of_ffv1_is_the_only_one_lost(tmp_path, frame_rate_hz):
 
 
 def test_a_packet_that_is_gone_leaves_its_number_behind(tmp_path):
-    """The head of a block overwritten: Matroska skips it, and the stamps tell that one is missing."""
+    """The head of a block overwritten: Matroska skips it, and the stamps show that one is missing."""
     path = tmp_path / "movie.mkv"
     write_ffv1(path, pictures(), 600.0)
     at, _ = packet_places(path)[12]
@@ -128,7 +128,7 @@ def packets(order: str) -> list[Packet]:
         ("ABCD", "b", "b"),
     ],
 )
-def test_what_is_decoded_after_a_damaged_frame_is_spoilt_up_to_the_next_key_frame(order, damaged, spoilt):
+def test_frames_after_a_damaged_one_are_spoilt_up_to_the_next_key_frame(order, damaged, spoilt):
     index = index_packets(packets(order), guessed=False)
     numbers = {ord(letter) - ord("a") for letter in spoilt}
     assert set(index.spoilt_by(ord(damaged) - ord("a"))) == numbers
@@ -141,7 +141,7 @@ def test_what_is_decoded_after_a_damaged_frame_is_spoilt_up_to_the_next_key_fram
         ([0, 2, 7, 8], "5/3", [0, 1, 4, 5]),  # two were lost
         ([0, 40, 80, 160], "20", [0, 1, 2, 4]),  # a header that counts fields
         ([0, 40, 95, 160], "40", [0, 1, 2, 3]),  # stamps that keep to no step only count
-        ([5, 45, 10**9], "40", [0, 1, 2]),  # nobody loses that many
+        ([5, 45, 10**9], "40", [0, 1, 2]),  # too many to be lost
     ],
 )
 def test_gaps_in_even_stamps_are_lost_frames(stamps, step, numbers):

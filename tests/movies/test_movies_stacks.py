@@ -156,7 +156,7 @@ def test_times_beside_the_data_set_are_the_movies(tmp_path, name):
     ],
     ids=["length", "stand still", "nan", "unit"],
 )
-def test_times_that_are_none_are_told_and_not_used(tmp_path, times, unit, word):
+def test_times_that_are_none_are_reported_and_not_used(tmp_path, times, unit, word):
     with h5py.File(tmp_path / "movie.h5", "w") as file:
         file["movie"], file["time"] = pictures(), times
         if unit:
@@ -166,7 +166,7 @@ def test_times_that_are_none_are_told_and_not_used(tmp_path, times, unit, word):
     assert word in movie.remarks[0]
 
 
-def test_hdf5_with_several_movies_asks_for_a_name(tmp_path):
+def test_hdf5_with_several_movies_is_refused_without_a_name(tmp_path):
     path = tmp_path / "movie.h5"
     with h5py.File(path, "w") as file:
         file["a/x"], file["b/x"], file["c"] = pictures(), pictures(), np.zeros(3)

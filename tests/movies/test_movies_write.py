@@ -1,4 +1,4 @@
-"""Writing: what is written comes back with its numbers and times, or nothing is left behind."""
+"""Writing: movies come back with their numbers and times, or no file is left."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def test_times_go_with_the_frames(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", ["mkv", "h5"])
-def test_what_cannot_be_written_leaves_the_old_movie_alone(tmp_path, suffix):
+def test_a_refused_movie_leaves_the_old_one_in_place(tmp_path, suffix):
     path = tmp_path / f"movie.{suffix}"
     path.write_bytes(b"the old one")
 

@@ -1,4 +1,4 @@
-"""Raw recording in a process of its own: no frame is held up, none is lost without a word, no file is half."""
+"""Raw recording in a process of its own: no frame is held up, lost ones are reported, no file is incomplete."""
 
 import multiprocessing
 import os
@@ -27,9 +27,9 @@ TIMES_S = np.cumsum(np.random.default_rng(1).uniform(0.1, 0.2, FRAMES)) - 1
 
 
 @contextmanager
-def recording(path: Path, tell: Callable[[str], object] = pytest.fail, like: np.ndarray | None = None, **options):
+def recording(path: Path, log: Callable[[str], object] = pytest.fail, like: np.ndarray | None = None, **options):
     like = pictures()[0] if like is None else like
-    recorder = Recorder(path, SimpleNamespace(frame_shape=like.shape, dtype=like.dtype), 0.1, tell, **options)
+    recorder = Recorder(path, SimpleNamespace(frame_shape=like.shape, dtype=like.dtype), 0.1, log, **options)
     try:
         yield recorder
     finally:
@@ -76,10 +76,10 @@ def test_times_that_stand_or_go_back_go_on_by_a_frame(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="of POSIX")
-def test_frames_that_find_no_room_are_lost_counted_and_told_once(tmp_path, monkeypatch):
+def test_frames_that_find_no_room_are_lost_counted_and_reported_once(tmp_path, monkeypatch):
     monkeypatch.setattr("sphereorient.movies.record.MOST_WAIT", 3)
-    told: list[str] = []
-    with recording(tmp_path / "run.mkv", told.append) as recorder:
+    messages: list[str] = []
+    with recording(tmp_path / "run.mkv", messages.append) as recorder:
         (process,) = multiprocessing.active_children()
         os.kill(process.pid, signal.SIGSTOP)  # a disk that hangs
         for k in range(20):
@@ -88,7 +88,7 @@ def test_frames_that_find_no_room_are_lost_counted_and_told_once(tmp_path, monke
         until(lambda: "3 frames" in recorder.summary())
         take(recorder, 2.0)
     assert recorder.summary().endswith("run.mkv: 4 frames recorded, 17 lost")
-    (only,) = told
+    (only,) = messages
     assert "frames are lost" in only
     assert load_times(tmp_path / "run.times.csv") == pytest.approx([0.0, 0.1, 0.2, 2.0])
 
@@ -103,12 +103,12 @@ def test_a_recording_that_waits_loses_nothing(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("after", [0, 64])
 def test_a_disk_that_is_nearly_full_ends_the_recording_whole(tmp_path, monkeypatch, after):
-    told: list[str] = []
+    messages: list[str] = []
     free = shutil.disk_usage(tmp_path).free
     if after and (free < 4 * LARGE or not hasattr(os, "posix_fallocate")):
         pytest.skip("needs room for a large file")
     monkeypatch.setattr("sphereorient.movies.record.LEFT_BYTES", free - LARGE if after else 1 << 62)
-    with recording(tmp_path / "run.mkv", told.append) as recorder:
+    with recording(tmp_path / "run.mkv", messages.append) as recorder:
         for k in range(after):
             take(recorder, 0.1 * k)
         until(lambda: f": {after} frames" in recorder.summary())
@@ -118,7 +118,7 @@ def test_a_disk_that_is_nearly_full_ends_the_recording_whole(tmp_path, monkeypat
         for k in range(after, after + 20):
             take(recorder, 0.1 * k)
     assert f"{after} frames recorded, 20 lost" in recorder.summary()
-    (only,) = told
+    (only,) = messages
     assert "expected a disk with room" in only
     (tmp_path / "large").unlink(missing_ok=True)
     movies = [open_movie(path) for path in tmp_path.glob("*.mkv")]
@@ -126,41 +126,41 @@ def test_a_disk_that_is_nearly_full_ends_the_recording_whole(tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("suffix", ["mkv", "h5"])
-def test_a_disk_that_takes_no_more_is_told_in_a_line_and_holds_nothing_up(tmp_path, suffix):
+def test_a_disk_that_takes_no_more_is_reported_in_a_line_and_holds_nothing_up(tmp_path, suffix):
     resource = pytest.importorskip("resource", reason="of POSIX")
     if not hasattr(resource, "prlimit"):
         pytest.skip("of Linux")
-    told, noise = [], np.random.default_rng(0).integers(0, 255, (50, 500, 600), np.uint8)
-    with recording(tmp_path / f"run.{suffix}", told.append, noise[0]) as recorder:
+    messages, noise = [], np.random.default_rng(0).integers(0, 255, (50, 500, 600), np.uint8)
+    with recording(tmp_path / f"run.{suffix}", messages.append, noise[0]) as recorder:
         (process,) = multiprocessing.active_children()
         resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
         for k, picture in enumerate(noise):
             take(recorder, 0.1 * k, picture)
-    (only,) = told
+    (only,) = messages
     assert "expected a file that can be written" in only
     assert [*tmp_path.iterdir()] == []
 
 
-def test_a_process_that_is_killed_is_told(tmp_path):
-    told: list[str] = []
-    with recording(tmp_path / "run.mkv", told.append) as recorder:
+def test_a_process_that_is_killed_is_reported(tmp_path):
+    messages: list[str] = []
+    with recording(tmp_path / "run.mkv", messages.append) as recorder:
         take(recorder, 0.0)
         multiprocessing.active_children()[0].kill()
-        until(lambda: told)
+        until(lambda: messages)
         for k in range(20):
             take(recorder, 1 + 0.1 * k)
-    (only,) = told
+    (only,) = messages
     assert "expected a process that records" in only
     assert not (tmp_path / "run.mkv").exists()
 
 
 def test_a_file_that_came_meanwhile_is_not_replaced(tmp_path):
-    path, told = tmp_path / "run.mkv", []
-    with recording(path, told.append) as recorder:
+    path, messages = tmp_path / "run.mkv", []
+    with recording(path, messages.append) as recorder:
         take(recorder, 0.0)
         path.write_text("mine")
     assert path.read_text() == "mine"
-    (only,) = told
+    (only,) = messages
     assert "expected a new file" in only
 
 

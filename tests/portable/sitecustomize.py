@@ -1,4 +1,4 @@
-"""In front of PYTHONPATH this hides from every process what Windows and macOS lack: posix modules, and `fork`."""
+"""In front of PYTHONPATH this hides from every process the posix modules and `fork`, which Windows lacks."""
 
 import multiprocessing
 import os

@@ -24,16 +24,16 @@ assert sys.modules["fcntl"] is sys.modules["resource"] is None and not hasattr(o
 @pytest.mark.slow
 def test_every_module_is_imported_without_posix():
     """Before: `import fcntl` in run/store.py ended `track` on Windows."""
-    told = subprocess.run([sys.executable, "-c", EVERY], env=HIDDEN, capture_output=True, text=True, check=False)
-    assert told.returncode == 0, told.stderr
+    result = subprocess.run([sys.executable, "-c", EVERY], env=HIDDEN, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
 
 
 @pytest.mark.slow
-def test_files_runs_and_workers_do_without_posix(tmp_path):
+def test_files_runs_and_workers_work_without_posix(tmp_path):
     """Locks, parts, --resume, workers, outputs: the quick tests of these rooms, and two workers on one movie."""
     rooms = [*("tests/files", "tests/run", "tests/cli/test_outputs.py"), "--deselect=tests/run/test_full_disk.py"]
     for words in (["-m", "not slow", *rooms], ["tests/run/test_drive.py", "-k", "two_workers"]):
         command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--basetemp={tmp_path}/t", *words]
-        told = subprocess.run(command, env=HIDDEN, cwd=REPO, capture_output=True, text=True, check=False)
-        assert told.returncode == 0, told.stdout[-3000:]
-        assert " passed" in told.stdout
+        result = subprocess.run(command, env=HIDDEN, cwd=REPO, capture_output=True, text=True, check=False)
+        assert result.returncode == 0, result.stdout[-3000:]
+        assert " passed" in result.stdout

@@ -52,7 +52,7 @@ def table_of(kind: str, blur_rad: float) -> TextureTable:
 
 @dataclass(frozen=True)
 class Rig:
-    """Cameras about a ball, and what was made for them once."""
+    """Cameras about a ball, and cached tables of them."""
 
     cameras: tuple[Camera, ...]
     sights: tuple[LinesOfSight, ...]
@@ -60,7 +60,7 @@ class Rig:
 
     @property
     def px_mm(self) -> float:
-        """What a pixel spans at the ball."""
+        """Size of a pixel at the ball."""
         return 2 * RADIUS_MM / self.diameter_px
 
     def table(self, kind: str) -> TextureTable:
@@ -126,7 +126,7 @@ def scene_of(
 
 
 def cut(rig: Rig, pictures: Tensor, X: Tensor, behind: float = BEHIND, full_scale: float = math.inf) -> Pixels:
-    """The pixels of all disks, cameras of a pose next to each other, about places that need not be exact."""
+    """The pixels of all disks, cameras of a pose next to each other, about inexact positions."""
     stencil = disk_stencil(1.06 * rig.diameter_px / 2 + 2.5 * BLUR_PX)
     background = scene_of(np.full(pictures.shape[-2:], behind, np.float32), full_scale=full_scale)
     disks = []
@@ -138,12 +138,12 @@ def cut(rig: Rig, pictures: Tensor, X: Tensor, behind: float = BEHIND, full_scal
 
 
 def flat_light(cameras: int, sigma: float) -> DiskLight:
-    """Nothing learnt but the noise."""
+    """Settings with learnt noise alone."""
     return DiskLight.unknown(cameras, torch.tensor([[sigma**2, 0.0, 0.0, 0.0]] * cameras))
 
 
 def model_of(paint: TextureTable, sigma: float = 1.0, shading: Shading = LATER) -> SphereModel:
-    """What the pictures of two cameras depend on, before any light is learnt."""
+    """Views of two cameras before any light is learnt."""
     light = flat_light(2, sigma)
     return SphereModel(radius_mm=RADIUS_MM, paint=paint, blur_px=BLUR_PX, light=light, shading=shading)
 
@@ -156,7 +156,7 @@ def refined(
 
 
 def fitted(rig: Rig, kind: str, pixels: Pixels, X: Tensor, R: Tensor, sigma: float, **changes: object) -> FittedPoses:
-    """Refine with all cameras, unless the changes say otherwise."""
+    """Refine with all cameras by default."""
     use = changes.pop("use", torch.ones(len(X), len(rig.cameras), dtype=torch.bool))
     iterations, known = changes.pop("iterations", 6), changes.pop("place_precision", None)
     given = {"radius_mm": RADIUS_MM, "paint": rig.table(kind), "blur_px": BLUR_PX}
@@ -182,7 +182,7 @@ def turn_errors(fit: FittedPoses, R: Tensor) -> Tensor:
 
 
 def fitter_of(rig: Rig, blur_px: float = BLUR_PX) -> Fitter:
-    """A fitter of the rig's cameras that knows no light, and guesses the blur."""
+    """A fitter of the rig's cameras without light, with a guessed blur."""
     views = []
     for k, camera in enumerate(rig.cameras):
         scene = CameraScene(background=scene_of(np.full((120, 120), BEHIND, np.float32)), diameter_px=rig.diameter_px)

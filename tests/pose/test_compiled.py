@@ -113,12 +113,12 @@ def case(request, pixels) -> tuple[Pixels, SphereModel, str]:
 
 def test_poses_covariances_and_scores_are_those_of_torch(case):
     pixels, model, kind = case
-    nll = 5e-3 if kind == "unseen paint" else 1e-3  # light is extrapolated to where the paint is unknown
+    nll = 5e-3 if kind == "unseen paint" else 1e-3  # light is extrapolated to unknown paint
     for iterations in (1, 4) if kind in MODELS else (4,):
         assert_as_torch(pixels, model, iterations, nll=nll)
 
 
-def test_residuals_and_what_they_consist_of_are_those_of_torch(case):
+def test_residuals_and_their_parts_are_those_of_torch(case):
     pixels, model, _ = case
     start = begin()
     given = pixels, start.position_lab_mm, start.R_lab_body
@@ -147,7 +147,7 @@ def test_occluders_are_those_of_torch(pixels, kind):
     covered = pixels.grey.clone()
     near = ((pixels.place - torch.tensor([[4], [-6]])).abs() <= 4).all(0)
     covered[::3, near] += 90.0
-    covered[1, :] = covered[1].flip(0)  # so much differs that nothing is taken for an occluder
+    covered[1, :] = covered[1].flip(0)  # too many pixels differ for an occluder
     hidden, model = replace(pixels, grey=covered), MODELS[kind](pixels)
     for most in (0.4, 1e-4):
         inside = COMPILED.kept(hidden, begin(), model, most)

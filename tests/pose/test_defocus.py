@@ -1,4 +1,4 @@
-"""Soft pictures: their blur is seen before anything else is known, and templates that are as soft find the attitude."""
+"""Soft pictures: their blur is measured first, and templates of the same blur find the attitude."""
 
 import cv2
 import numpy as np
@@ -32,7 +32,7 @@ def test_the_blur_of_an_edge_is_read_off_its_slope(blur_px, noise):
     assert steepest_blur_px(step(blur_px, noise)) == pytest.approx(blur_px, rel=0.2, abs=0.3)
 
 
-def test_a_picture_of_one_grey_is_not_divided_by_nothing():
+def test_a_picture_of_one_grey_is_not_divided_by_zero():
     assert np.isfinite(steepest_blur_px(np.full((40, 40), 7.0, np.float32)))
 
 
@@ -75,6 +75,6 @@ def test_templates_as_soft_as_the_pictures_find_what_sharp_ones_miss():
     R = attitudes(24)
     disks = blurred_disks(R)
     soft = GreySearch(texture_of("patches"), GreySearchSettings(), blur=WIDE)
-    told = share_found(soft, disks, R)
-    assert told > 0.85
-    assert told > share_found(grey_search_of("patches"), disks, R) + 0.15
+    share = share_found(soft, disks, R)
+    assert share > 0.85
+    assert share > share_found(grey_search_of("patches"), disks, R) + 0.15

@@ -45,7 +45,7 @@ COUNT = 10
 DIAMETER_PX = 48.0
 SLOW = pytest.mark.slow
 RIGS = {"two": ("pinhole", "tsai"), "one": ("pinhole",)}
-# rms over poses of the noise and of what the model simplifies: rotation in degrees, place across the sight in mm
+# rms over poses of the noise and of the model's simplifications: rotation in degrees, place across the sight in mm
 ROTATION_RMS = {"two": 0.075, "one": 0.14}
 ACROSS_RMS_MM, DEPTH_RMS_MM = 0.009, 0.2
 
@@ -89,7 +89,7 @@ def apart_mm(one: FittedPoses, other: FittedPoses) -> float:
 
 
 def errors(fit: FittedPoses, X: Tensor, R: Tensor) -> Tensor:
-    """(B, 6): rotation in rad, place in mm; what the covariance is of."""
+    """Errors (B, 6) as in the covariance: rotation in rad, position in mm."""
     return torch.cat([turn_errors(fit, R), X - fit.position_lab_mm], dim=1)
 
 
@@ -227,7 +227,7 @@ def test_light_of_low_order_over_the_disk_does_not_matter():
     assert apart_deg(fit, fitted(rig(), "patches", pixels, X, R, SIGMA)) < 0.05
 
 
-def test_saturated_pixels_tell_only_that_their_grey_level_is_at_least_that_one():
+def test_saturated_pixels_give_only_a_lower_bound_of_their_grey_level():
     X, R = truth()
     full = 0.5 * (BLACK + WHITE)  # nearly all white paint is clipped
     frames = pictures().clamp_max(full)
@@ -253,7 +253,7 @@ def test_a_picture_that_is_white_all_over_is_not_explained_by_paint(body, monkey
     assert float(fitted(rig(), "patches", white, X, R, SIGMA).score.max()) < 0.1
 
 
-def test_the_deviation_of_normal_residuals_is_one_whatever_a_few_of_them_are():
+def test_the_deviation_of_normal_residuals_is_one_with_a_few_arbitrary_ones():
     rng = torch.Generator().manual_seed(0)
     residual = 3.0 * torch.randn(2, 40000, generator=rng)
     residual[:, ::9] = 500.0
@@ -277,12 +277,12 @@ def test_a_bubble_before_part_of_the_disk_does_not_move_the_pose():
     lured = whitened(from_truth(), errors(fit, X, R) - errors(from_truth(), X, R))
     assert rms(lured) < 0.8
     assert lured.abs().max() < 4
-    # Its score falls, for those pixels are not explained; it stays above any wrong pose's.
+    # Its score falls, because those pixels are not explained, but stays above any wrong pose's.
     assert (fit.score < from_truth().score).all()
     assert (fit.score > 0.5).all()
 
 
-def test_the_score_tells_paint_from_a_smooth_disk_and_from_the_empty_scene():
+def test_the_score_distinguishes_paint_from_a_smooth_disk_and_from_the_empty_scene():
     """A blob that is lit from one side is explained to 90 % by shades alone: that is no evidence for the paint."""
     X, R = truth()
     _, ball = shares()
@@ -313,25 +313,25 @@ def test_masked_pixels_do_not_count():
     assert sigma / sigma_all == pytest.approx(math.sqrt(5 / 4), abs=0.08)
 
 
-def test_a_camera_alone_would_not_turn_what_it_has_fitted():
+def test_the_only_camera_has_no_change_by_itself():
     fit = from_truth("one")
     assert_close(fit.own_turn, torch.zeros_like(fit.own_turn), atol=1e-9)
     assert_close(fit.own_move, torch.zeros_like(fit.own_move), atol=1e-6)
 
 
-def test_what_the_cameras_would_do_alone_adds_up_to_nothing():
+def test_changes_by_each_camera_alone_add_up_to_zero():
     fit = from_truth()
     weight = torch.linalg.inv(fit.own_covariance)
     mean = torch.linalg.solve(weight.sum(1), (weight @ fit.own_turn[..., None]).sum(1))[..., 0]
     assert rms(mean) < 0.3 * rms(fit.own_turn)
-    # They disagree by as much as they say.
+    # They disagree by as much as they state.
     fit = from_truth(count=40)
     apart = (fit.own_turn[:, 0] - fit.own_turn[:, 1])[..., None]
     root = torch.linalg.cholesky(fit.own_covariance.sum(1))
     assert 0.7 < rms(torch.linalg.solve_triangular(root, apart, upper=False)) < 1.5
 
 
-def test_what_a_camera_would_do_alone_is_what_it_fits_alone():
+def test_the_change_by_a_camera_alone_is_its_own_fit():
     X, R = truth()
     fit = from_truth()
     for camera in range(2):
@@ -339,8 +339,8 @@ def test_what_a_camera_would_do_alone_is_what_it_fits_alone():
         use[:, camera] = True
         alone = fitted(rig(), "patches", disks(), X, R, SIGMA, iterations=8, use=use)
         places = alone.position_lab_mm, fit.position_lab_mm + fit.own_move[:, camera]
-        seen, told = (rig().cameras[camera].project(place) for place in places)
-        assert (seen - told).norm(dim=-1).max() < 0.02  # px
+        seen, projected = (rig().cameras[camera].project(place) for place in places)
+        assert (seen - projected).norm(dim=-1).max() < 0.02  # px
 
 
 def second_shows(X: Tensor, R: Tensor, **changes: object) -> FittedPoses:
@@ -351,10 +351,10 @@ def second_shows(X: Tensor, R: Tensor, **changes: object) -> FittedPoses:
     return fitted(rig(), "patches", cut(rig(), frames, truth()[0]), *truth(), SIGMA, **changes)
 
 
-def test_cameras_that_show_different_attitudes_say_by_how_much():
+def test_disagreement_of_cameras_in_attitude_is_measured():
     X, R = truth()
     delta = f64([0.006, -0.004, 0.008])
-    # The place held: else it moves to where paint and limb disagree least, and takes a part of the turn.
+    # The position is held: a free one would move and take a part of the rotation.
     held = (1e9 * torch.eye(3, dtype=torch.float64)).expand(COUNT, 3, 3)
     fit = second_shows(X, so3.exp(delta) @ R, place_precision=held)
     assert (fit.own_turn[:, 1] - fit.own_turn[:, 0] - delta).mean(0).norm() < 0.15 * delta.norm()
@@ -363,7 +363,7 @@ def test_cameras_that_show_different_attitudes_say_by_how_much():
     assert ((share > 0.2) & (share < 0.8)).all()
 
 
-def test_cameras_that_show_different_places_say_by_how_much():
+def test_disagreement_of_cameras_in_position_is_measured():
     # Lab x lies across both lines of sight.
     X, R = truth()
     fit = second_shows(X + f64([0.03, 0.0, 0.0]), R)
@@ -386,7 +386,7 @@ def test_a_camera_not_in_use_does_not_count(camera):
     assert one.position_lab_mm.equal(other.position_lab_mm)
     assert one.covariance.equal(other.covariance)
     assert one.nll.equal(other.nll)
-    # Along its own line of sight it knows little: lab y for the first, lab z for the second.
+    # Along its own line of sight its error is large: lab y for the first, lab z for the second.
     sigma = one.covariance.diagonal(dim1=1, dim2=2).sqrt()[:, 3:].mean(0)
     assert int(sigma.argmax()) == (1, 2)[camera]
     assert sigma.max() > 5 * sigma.median()
@@ -410,7 +410,7 @@ def test_a_pose_that_no_camera_sees_stays_where_it_is_and_the_others_do_not(star
     assert (whole.R_lab_body[3] - R[3]).abs().max() > 1e-3
 
 
-def test_a_pose_whose_start_is_not_a_number_leaves_the_others_alone():
+def test_a_pose_whose_start_is_not_a_number_changes_no_others():
     X, R = truth()
     lost = X.clone()
     lost[3] = torch.nan
@@ -430,7 +430,7 @@ def prior_pull(precision: float) -> tuple[Tensor, FittedPoses]:
     return (fit.position_lab_mm - free.position_lab_mm)[:, 1] / 0.2, fit
 
 
-def test_a_prior_pulls_as_its_information_says():
+def test_a_prior_pulls_by_its_information():
     # With information I a prior of precision p moves the place by p / (p + I) of the way: I follows from one, the
     # others must agree.
     known = 100.0
@@ -439,13 +439,13 @@ def test_a_prior_pulls_as_its_information_says():
     assert ((share > 0.2) & (share < 0.9)).all()
     for precision in (25.0, 400.0):
         assert_close(prior_pull(precision)[0], precision / (precision + own), atol=0.03)
-    # And it is the information that the covariance without a prior states, but for what a limb's error adds there.
+    # And it is the information of the covariance without a prior, less the part of a limb's error.
     stated = 1 / from_truth("one").covariance[:, 4, 4]
     assert ((own / stated > 0.9) & (own / stated < 6)).all()
     assert (fit.covariance[:, 4, 4] < from_truth("one").covariance[:, 4, 4]).all()
 
 
-def test_a_prior_beyond_doubt_holds_the_place_and_one_of_nothing_does_nothing():
+def test_a_strong_prior_holds_the_position_and_a_zero_prior_changes_nothing():
     X, R = truth()
     start = X + f64([0, 0.2, 0.1])
     for precision, expected in ((1e12, start), (1e-6, from_truth("one").position_lab_mm)):
@@ -459,7 +459,7 @@ def test_a_prior_beyond_doubt_holds_the_place_and_one_of_nothing_does_nothing():
     assert (along.position_lab_mm - fit.position_lab_mm)[:, [0, 2]].abs().max() < 0.02
 
 
-def test_score_and_likelihood_tell_wrong_poses():
+def test_score_and_likelihood_show_wrong_poses():
     right = from_truth()
     X, R = right.position_lab_mm, right.R_lab_body
     scores, nll = [], []
@@ -475,7 +475,7 @@ def test_score_and_likelihood_tell_wrong_poses():
 
 
 @pytest.mark.slow
-def test_the_likelihood_falls_off_as_the_covariance_says():
+def test_the_likelihood_falls_off_as_the_covariance_states():
     # Three standard deviations from the best pose the negative logarithm is 4.5 higher; noise moves its minimum.
     count = 40
     fit = from_truth(count=count)
@@ -538,7 +538,7 @@ def test_a_fit_is_float64_with_rotations_that_are_rotations_and_covariances_that
 
 @pytest.mark.slow
 def test_errors_that_neighbours_share_widen_the_covariance():
-    # The same scatter in every pixel, but in clouds of two pixels: there is far less to learn from them.
+    # The same scatter in every pixel, but in clouds of two pixels: they hold far less information.
     X, R = truth()
     paint, ball = shares()
     clean = BEHIND + (BLACK - BEHIND) * ball + (WHITE - BLACK) * paint
@@ -592,14 +592,14 @@ def check_coverage(cameras: str, scaled: Tensor, in_sigmas: Tensor) -> None:
 
 
 @pytest.mark.parametrize("cameras", [pytest.param("two", marks=SLOW), "one"])
-def test_errors_are_as_large_as_the_covariance_says(cameras):
+def test_errors_are_as_large_as_the_covariance_states(cameras):
     check_coverage(cameras, *drawn(64.0, cameras, "patches", 20, 6))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["patches", "blobs"])
 @pytest.mark.parametrize("cameras", RIGS)
-def test_errors_of_2000_noisy_renders_are_as_large_as_the_covariance_says(cameras, kind):
+def test_errors_of_2000_noisy_renders_are_as_large_as_the_covariance_states(cameras, kind):
     scaled, in_sigmas = drawn(64.0, cameras, kind, 200, 10)
     assert len(scaled) == 2000
     check_coverage(cameras, scaled, in_sigmas)

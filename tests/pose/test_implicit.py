@@ -88,7 +88,7 @@ def test_neither_graph_nor_gradient_depends_on_the_number_of_iterations(points, 
 
 def test_frames_without_anything_are_nan_and_their_gradients_0(points):
     body, seen = points.clone(), points.clone()
-    seen[1] = 0.0  # what is there does not matter
+    seen[1] = 0.0  # values there do not matter
     seen.requires_grad_()
     use = torch.tensor([True, False, True])
     got, whole = fitted_points(body, seen, use=use), fitted_points(body, seen)
@@ -97,7 +97,7 @@ def test_frames_without_anything_are_nan_and_their_gradients_0(points):
     assert got.arrived.tolist() == [True, False, True]
     (gradient,) = torch.autograd.grad(got.R_lab_body[use].sum() + got.cost.sum(), seen)
     assert_close(gradient[1], torch.zeros_like(gradient[1]))
-    assert_close(got.R_lab_body[use], whole.R_lab_body[use])  # the others do not notice
+    assert_close(got.R_lab_body[use], whole.R_lab_body[use])  # the others do not change
     nobody = fitted_points(body, seen, use=torch.zeros(3, dtype=torch.bool))
     assert_close(torch.autograd.grad(nobody.cost.sum(), seen)[0], torch.zeros_like(seen))
 
@@ -112,8 +112,8 @@ def test_starts_that_are_nan_are_not_used():
     assert torch.autograd.grad(got.cost.sum() + got.position_lab_mm[1].sum(), scale)[0].isfinite()
 
 
-def test_what_nothing_determines_stays_and_has_no_gradient(points):
-    # One point: a turn about it, and turns against moves, leave the residual as it is.
+def test_an_undetermined_direction_stays_and_has_no_gradient(points):
+    # One point: a rotation about it, and rotations against moves, leave the residual as it is.
     seen = (points[:, :1] + 0.1).requires_grad_()
     got = fitted_points(torch.zeros_like(points[:, :1]), seen)
     assert_close(got.position_lab_mm, seen.detach()[:, 0], 1e-9)
@@ -122,7 +122,7 @@ def test_what_nothing_determines_stays_and_has_no_gradient(points):
     assert_close(gradient, torch.ones_like(gradient), 1e-6)
 
 
-def test_a_fit_that_has_not_arrived_says_so_and_gives_no_gradient(points):
+def test_a_fit_that_has_not_converged_is_marked_and_gives_no_gradient(points):
     seen = (points @ so3.exp(f64([2.0, 1.0, -1.0])).mT).requires_grad_()
     got = fitted_points(points, seen, iterations=1)
     assert not got.arrived.any()
@@ -157,7 +157,7 @@ def test_small_errors_multiply_from_the_left_in_lab_components():
     assert_close(large @ large.mT, torch.eye(3, dtype=torch.float64)[None])
 
 
-def test_what_does_not_belong_together_is_refused(points):
+def test_inconsistent_arguments_are_refused(points):
     view, zero = torch.eye(3).expand(2, 3, 3), torch.zeros(2, 3)
     with pytest.raises(ShapeError, match="residual"):
         implicit_pose(lambda R, X: X.sum(), view, zero)

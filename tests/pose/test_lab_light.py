@@ -132,7 +132,7 @@ def test_a_planted_light_is_found_again(cameras):
     _, pixels, X, R, model = pictures(6, cameras, 9)
     view = sphere_view(pixels, X.repeat_interleave(cameras, 0), R.repeat_interleave(cameras, 0), model)
     within = view.aside < 0.95
-    # A slope over all frames of few cameras is nearly what their own light may have: its prior share stays unknown.
+    # A slope over all frames of few cameras is nearly one of their own light: its prior share stays unknown.
     for got, expected in zip(light.at(view, pixels), planted(cameras).at(view, pixels), strict=True):
         error = (got - expected)[within]
         assert error.square().mean().sqrt() < 2.5
@@ -213,7 +213,7 @@ def test_light_beside_the_sphere_is_found_and_moves_no_pose():
         off.append(float((fit.position_lab_mm - X).mean(0).norm()))
         stated.append(float(fit.covariance[:, 3:, 3:].diagonal(dim1=1, dim2=2).mean().sqrt()))
     assert off[0] < 0.5 * off[1]
-    assert stated[0] > 1.1 * stated[1]  # light that does not end at the limb is not known there
+    assert stated[0] > 1.1 * stated[1]  # light that does not end at the limb is undetermined there
 
 
 def test_no_light_beside_the_sphere_is_invented():
@@ -322,7 +322,7 @@ def test_lamps_that_only_one_camera_sees_stay_maps_of_the_disk():
     assert lit_in_the_lab(maps, pixels, fit, use)[:2] == (maps, fit)
 
 
-def test_two_lights_that_explain_as_much_are_both_told(monkeypatch):
+def test_two_lights_that_explain_as_much_are_both_reported(monkeypatch):
     rig, pixels, X, R, _ = pictures()
     maps, fit, use = of_maps(rig, pixels, X, R)
     monkeypatch.setattr(kinds, "ALIKE", math.inf)

@@ -1,4 +1,4 @@
-"""Errors that all frames share: small where there is noise alone, and as large as they are where light stays wrong."""
+"""Errors that all frames share: small with noise alone, and as large as the true errors with wrong light."""
 
 from dataclasses import replace
 from functools import cache
@@ -41,7 +41,7 @@ RIG = rig_of()
 
 @cache
 def studied(count: int, lobe: float, *, glints: bool) -> tuple[Pixels, FittedPoses, Tensor, SphereModel]:
-    """Fits to pictures with a reflection; without `glints` no model knows it."""
+    """Fits to pictures with a reflection; without `glints` no model holds it."""
     X, R = balls(count, 4)
     pictures = pictures_of(RIG, "patches", X, R)
     row, column = torch.meshgrid(*(torch.arange(size) for size in pictures.shape[-2:]), indexing="ij")
@@ -62,7 +62,7 @@ def studied(count: int, lobe: float, *, glints: bool) -> tuple[Pixels, FittedPos
 
 @cache
 def measured(count: int, lobe: float, *, glints: bool = False) -> tuple[Tensor, FittedPoses, Lasting]:
-    """Errors (B, 6), rad and mm, of such fits, and what lasts of them."""
+    """Errors (B, 6), rad and mm, of such fits, and their errors that last."""
     X, R = balls(count, 4)
     pixels, fit, use, model = studied(count, lobe, glints=glints)
     found = lasting_errors(pixels, fit, use, model)
@@ -70,7 +70,7 @@ def measured(count: int, lobe: float, *, glints: bool = False) -> tuple[Tensor, 
     return off, fit, found
 
 
-def test_of_noise_alone_little_lasts():
+def test_noise_alone_gives_little_error_that_lasts():
     _, fit, found = measured(COUNT, 0.0)
     frame = so3.trace(fit.covariance[:, :3, :3]).mean()
     assert so3.trace(found.covariance[:3, :3]) < 0.1 * frame
@@ -78,7 +78,7 @@ def test_of_noise_alone_little_lasts():
     assert found.own_rad2.shape == (2, 3, 3)
 
 
-def test_what_a_reflection_does_to_all_poses_is_stated():
+def test_the_error_of_all_poses_by_a_reflection_is_stated():
     off, _, found = measured(COUNT, LOBE)
     calm = measured(COUNT, 0.0)[2]
     assert so3.trace(found.covariance[:3, :3]) > 3 * so3.trace(calm.covariance[:3, :3])
@@ -112,7 +112,7 @@ def test_a_glint_follows_its_pixels_and_a_mat_ball_has_none(count: int):
     assert medians[0] < 0.5 < 0.8 < medians[1]
 
 
-def test_one_frame_tells_no_glints():
+def test_one_frame_gives_no_glints():
     pixels, fit, use, model = studied(1, LOBE, glints=True)
     at = fitted_residuals(pixels, fit, model)
     assert glint_shares(at, use, model.light.mirrors(at.view, pixels)).max() < 1e-6
@@ -135,7 +135,7 @@ def test_cells_are_eliminated_as_far_as_they_may_change():
     torch.testing.assert_close(found, exact, rtol=1e-6, atol=1e-9)
 
 
-def test_of_one_frame_more_may_last_than_of_many():
+def test_more_error_may_last_of_one_frame_than_of_many():
     one, many = (measured(count, LOBE)[2] for count in (1, COUNT))
     assert so3.trace(one.covariance[:3, :3]) > so3.trace(many.covariance[:3, :3])
     alone = many.of(1)
@@ -190,10 +190,10 @@ def test_leaving_out_is_fitting_again():
     torch.testing.assert_close(found, 0.75 * moved.mT @ moved, rtol=1e-6, atol=0.0)
 
 
-def test_what_two_models_differ_in_is_within_one_sigma():
+def test_the_difference_of_two_models_is_within_one_sigma():
     _, fit, found = measured(COUNT, 0.0)
     use = torch.ones(COUNT, 2, dtype=torch.bool)
-    use[::2, 1] = False  # whatever a camera that is not in use says counts for nothing
+    use[::2, 1] = False  # an unused camera does not count
     more = torch.tensor([[3e-3, 0.0, 0.0], [0.0, -2e-3, 0.0]], dtype=torch.float64)
     own = torch.where(use[..., None], fit.own_turn + more, torch.nan_to_num(torch.full((), torch.inf)))
     for turn_rad, moved_mm in ((1e-3, 0.02), (1e-7, 1e-6)):
@@ -207,7 +207,7 @@ def test_what_two_models_differ_in_is_within_one_sigma():
         )
         wide = found.widened(fit, other, use)
         way = torch.cat([turn, move])
-        if turn_rad < 1e-6:  # less than what lasts anyway
+        if turn_rad < 1e-6:  # less than the error that lasts anyway
             assert wide.covariance.equal(found.covariance)
             continue
         assert_close(way @ torch.linalg.solve(wide.covariance, way), torch.ones((), dtype=torch.float64), atol=1e-4)
@@ -216,7 +216,7 @@ def test_what_two_models_differ_in_is_within_one_sigma():
             assert_close(distance2, torch.ones((), dtype=torch.float64), atol=1e-4)
 
 
-def test_light_by_the_logarithm_of_its_power_is_as_differences_say():
+def test_light_by_the_logarithm_of_its_power_is_that_of_differences():
     light, scale, step = torch.tensor([3.0, 40.0, 90.0], dtype=torch.float64), torch.tensor(40.0), 1e-5
     more, less = (scale * (light / scale) ** np.exp(power) for power in (step, -step))
     assert_close(by_power(light, scale), (more - less) / (2 * step), atol=1e-6)

@@ -176,7 +176,7 @@ def test_pixels_without_weight_do_not_count():
 
 
 def test_a_disk_that_shows_white_paint_only_leaves_small_maps():
-    # Nothing tells difference from black: the ridge shares the light between them, and their sum is right.
+    # The pictures do not determine the difference from black: the ridge shares the light; the sum is right.
     pixels, view = views()
     view = replace(view, paint=torch.ones_like(view.paint))
     grey = lit(pixels, view)
@@ -228,7 +228,7 @@ def test_pixels_outside_do_not_count_for_noise():
 
 
 @pytest.mark.parametrize(("count", "expected"), [(0, 1.0), (100, 25.0)])
-def test_few_pixels_tell_one_variance_only(count, expected):
+def test_few_pixels_give_one_variance_only(count, expected):
     residual = 5 * torch.tensor([1.0, -1.0]).repeat(count // 2)
     found = noise_curve(torch.linspace(10, 200, count), residual, torch.ones(count, dtype=torch.bool))
     assert found.tolist() == [expected, 0, 0, 0]

@@ -1,4 +1,4 @@
-"""How much of the limb gives the position: what is left of it, by geometry, for compiled code and torch."""
+"""The share of the limb used for the position, by geometry, for compiled code and torch."""
 
 from dataclasses import replace
 
@@ -62,7 +62,7 @@ def test_a_mask_over_a_half_and_over_a_quarter_leaves_the_rest(body):
 
 
 @pytest.mark.parametrize("body", BODIES)
-def test_what_the_border_cuts_does_not_count(body):
+def test_pixels_beyond_the_border_do_not_count(body):
     X, R = balls(COUNT, 1)
     X = X + f64([[17.0 + 2 * k, 0.0, 0.0] for k in range(COUNT)])  # to the right in both cameras
     expected = []

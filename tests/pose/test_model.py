@@ -61,7 +61,7 @@ def ball(reach_mm: float = 4.0) -> tuple[Tensor, Tensor]:
 
 
 def empty(rig: Rig, X: Tensor, shift: tuple[int, int] = (0, 0)) -> Pixels:
-    """The pixels about places, of pictures that show nothing."""
+    """The pixels about places, of empty pictures."""
     (camera,), (sight,) = rig.cameras, rig.sights
     stencil = disk_stencil(1.06 * rig.diameter_px / 2 + 2.5 * BLUR_PX)
     nothing = np.zeros((sight.size[1], sight.size[0]), np.float32)
@@ -167,7 +167,7 @@ def test_places_on_the_disk_are_those_of_the_picture_in_radii():
     assert view.across.norm(dim=1).max() <= 1.0 + 1e-6
 
 
-def test_a_nearer_ball_is_larger_as_the_cone_about_it_says():
+def test_a_nearer_ball_is_larger_as_the_cone_about_it_gives():
     one = rig("pinhole", 40.0)
     camera = one.cameras[0]
     for y in (-60.0, 0.0, 80.0):
@@ -207,7 +207,7 @@ def difference(one: SphereView, other: SphereView, name: str) -> Tensor:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_paint_changes_with_rotation_as_its_derivative_says(model):
+def test_paint_changes_with_rotation_as_its_derivative_gives(model):
     one, (X, R) = rig(model, 40.0), ball()
     pixels, h = empty(one, X), 0.02
     view = looked(pixels, X, R)
@@ -224,7 +224,7 @@ def test_paint_changes_with_rotation_as_its_derivative_says(model):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_coverage_changes_with_the_place_as_its_derivative_says(model):
+def test_coverage_changes_with_the_position_as_its_derivative_gives(model):
     one, (X, R) = rig(model, 40.0), ball()
     pixels, h = empty(one, X), 0.1 * PITCH_MM
     view = looked(pixels, X, R)
@@ -238,7 +238,7 @@ def test_coverage_changes_with_the_place_as_its_derivative_says(model):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_paint_changes_with_the_place_as_its_derivative_says(model):
+def test_paint_changes_with_the_position_as_its_derivative_gives(model):
     one, (X, R) = rig(model, 40.0), ball()
     pixels, h = empty(one, X), 0.2 * PITCH_MM
     view = looked(pixels, X, R)
@@ -255,8 +255,8 @@ def test_paint_changes_with_the_place_as_its_derivative_says(model):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_sharp_paint_changes_as_its_derivatives_say_on_the_whole(model):
-    # What Gauss-Newton needs: the projection of a finite change on the derivatives gives the change's size back.
+def test_sharp_paint_changes_as_its_derivatives_give_on_the_whole(model):
+    # For Gauss-Newton: the projection of a finite change on the derivatives is the change's size.
     one, (X, R) = rig(model, 40.0), ball()
     pixels = empty(one, X)
     assert exposed(sphere_view(pixels, X, R, model_of(table()))).max() > 0.9
@@ -279,7 +279,7 @@ def changes_by_its_derivatives(pixels: Pixels, X: Tensor, R: Tensor, paint: Text
         assert float(((both[0] - both[1]) @ by_pose[i]) / (by_pose[i] @ by_pose[i])) == pytest.approx(size, rel=0.06)
 
 
-MOVED = f64([[0.04, -0.06, 0.08, 2.0 * PITCH_MM, 0.0, -1.5 * PITCH_MM]])  # turn, rad, and move, mm
+MOVED = f64([[0.04, -0.06, 0.08, 2.0 * PITCH_MM, 0.0, -1.5 * PITCH_MM]])  # rotation, rad, and move, mm
 
 
 def exposed(view: SphereView) -> Tensor:
@@ -314,7 +314,7 @@ def test_paint_that_turns_in_the_exposure_is_smeared():
     assert turning < 0.05 * still
 
 
-def test_a_moving_sphere_changes_as_its_derivatives_say():
+def test_a_moving_sphere_changes_as_its_derivatives_give():
     one, (X, R) = rig("pinhole", 40.0), ball()
     changes_by_its_derivatives(replace(empty(one, X), moved=MOVED, instants=3), X, R, smooth_table())
 

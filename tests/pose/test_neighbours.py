@@ -1,4 +1,4 @@
-"""Other spheres in the picture: which places of a disk do not count, and fits that look past them."""
+"""Other spheres in the picture: places of a disk that do not count, and fits without them."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What covers the sphere is found as connected residuals; noise and single outliers are not."""
+"""Occluders are found as connected residuals; noise and single outliers are none."""
 
 import torch
 from refine_examples import balls, cut, noisy, pictures_of, rig_of

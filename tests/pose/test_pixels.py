@@ -29,7 +29,7 @@ def camera(model: str) -> Camera:
 
 
 def places() -> np.ndarray:
-    """A picture whose grey level tells the pixel: u + 100 v."""
+    """A picture whose grey level is the pixel: u + 100 v."""
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     return (u + 100 * v).astype(np.float32)
 
@@ -40,7 +40,7 @@ def disk(model: str = "pinhole", middle=(30.2, 20.7), radius_px: float = 9.0, st
 
 
 @pytest.mark.parametrize("model", ["pinhole", "tsai", "telecentric"])
-def test_every_pixel_looks_where_the_camera_says(model):
+def test_every_pixel_looks_along_its_line_of_sight(model):
     pixels = disk(model)
     uv = torch.stack([pixels.grey[0] % 100, torch.div(pixels.grey[0], 100, rounding_mode="floor")], dim=-1).double()
     rays = camera(model).rays(uv)
@@ -52,7 +52,7 @@ def test_every_pixel_looks_where_the_camera_says(model):
 
 
 @pytest.mark.parametrize("kind", ["pinhole", "fisheye", "port", "telecentric"])
-def test_a_balls_size_says_how_far_it_is_also_behind_a_port(kind):
+def test_a_balls_size_gives_its_distance_also_behind_a_port(kind):
     lens = (
         behind_port(pinhole())
         if kind == "port"
@@ -63,7 +63,7 @@ def test_a_balls_size_says_how_far_it_is_also_behind_a_port(kind):
     direction, there, distance = LinesOfSight(lens).of_size(middle_px[None].numpy(), radius_mm / float(radius_px))
     origin = f64(there[0] - distance[0] * direction[0])
     away = float((X - f64(there[0])).norm())
-    if kind == "telecentric":  # its pictures do not say
+    if kind == "telecentric":  # its pictures do not show the distance
         assert distance[0] == 0.0
         assert float(torch.linalg.cross(X - origin, f64(direction[0])).norm()) < 0.2
     else:
@@ -176,7 +176,7 @@ def test_a_stencil_is_all_places_within_its_radius_but_the_outermost_few(radius_
     }
     assert got <= expected
     assert len(got) == len(stencil.right) == len(expected) // VECTOR * VECTOR
-    # None is left out that is nearer than one that is not.
+    # Left-out places are farther than all others.
     left_out = [u * u + v * v for u, v in expected - got]
     assert min(left_out, default=math.inf) >= max(u * u + v * v for u, v in got)
     assert stencil.reach >= max(abs(u) for u, _ in got)
@@ -250,7 +250,7 @@ def test_every_third_place(model):
     assert some.direction.equal(pixels.direction[:, :, places])
     assert some.tile.equal(pixels.tile[places])
     assert some.origin.shape[-1] == (len(places) if model == "telecentric" else 1)
-    # The first `inner` places of what is left are again those well within.
+    # The first `inner` places of the rest are again those well within.
     assert 0 < some.inner < len(places)
     assert (places[: some.inner] < pixels.inner).all()
     assert (places[some.inner :] >= pixels.inner).all()
@@ -267,7 +267,7 @@ def test_cameras_of_one_and_of_many_origins_stand_in_one_record():
 
 
 def wide(**changes: object) -> FisheyeCamera:
-    """A lens of which the picture shows more than all directions."""
+    """A lens whose picture covers more than all directions."""
     common = {"R_cam_lab": f64(LOOKS[0]), "T_cam_lab_mm": f64([0.0, 0.0, 60.0]), "image_size": (WIDTH, HEIGHT)}
     lens = {"centre_px": f64([29.5, 21.5]), "f_px": f64([8.0, 8.0]), "k": f64([0.0] * 4)}
     return FisheyeCamera(**common | lens | changes)

@@ -59,7 +59,7 @@ def scene():
 
 
 def start(X, R, *, held: bool = False) -> PoseStart:
-    """Poses off by less and by more than the first step can mend."""
+    """Poses with errors below and above the reach of the first step."""
     count = len(X)
     off = torch.linspace(0.05, 2.0, count).tolist()
     use = torch.ones(count, 2, dtype=torch.bool)
@@ -188,7 +188,7 @@ def test_each_disk_may_have_axes_of_its_own(scene, monkeypatch):
     turning = type(sight).__new__(type(sight))
     vars(turning).update(vars(sight))
 
-    def axes_at(middle_px):  # turned about the camera's axis, by place
+    def axes_at(middle_px):  # rotated about the camera's axis, by position
         angle = middle_px.double().round()[:, :1] @ torch.tensor([[0.0, 0.0, 0.3]]).double()
         return (so3.exp(angle) @ RIG.cameras[1].R_cam_lab)[:, :2].float()
 

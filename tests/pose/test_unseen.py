@@ -1,4 +1,4 @@
-"""Paint that no picture showed weighs nothing, whatever the map holds there."""
+"""Unseen paint has no weight, for any value of the map there."""
 
 import math
 
@@ -30,7 +30,7 @@ def fit(pixels, fill: float, known: bool, start=None):
 
 @pytest.fixture(scope="module")
 def known(pixels):
-    """The fit that knows which paint was never seen."""
+    """The fit with the mask of unseen paint."""
     return fit(pixels, 0.5, known=True)
 
 
@@ -39,13 +39,13 @@ def rms_deg(found) -> float:
 
 
 @pytest.mark.slow
-def test_what_the_map_holds_there_moves_nothing(pixels, known):
+def test_values_of_the_map_there_move_nothing(pixels, known):
     white = fit(pixels, 1.0, known=True)
     apart = so3.geodesic_distance(known.R_lab_body, white.R_lab_body)
     assert float(apart.max()) < math.radians(0.03)  # a fiftieth of the fill reaches over the border
 
 
-def test_the_pose_is_as_good_as_the_known_paint_and_its_error_says_so(pixels, known):
+def test_the_pose_is_as_good_as_the_known_paint_and_so_is_its_stated_error(pixels, known):
     assert rms_deg(known) < 0.15
     assert rms_deg(fit(pixels, 0.5, known=False)) > 3 * rms_deg(known)
     error = torch.cat([turn_errors(known, R), X - known.position_lab_mm], -1)
@@ -73,7 +73,7 @@ def share_known() -> torch.Tensor:
 
 @pytest.mark.slow
 def test_a_wrong_pose_does_not_hide_behind_unknown_paint(pixels, known):
-    """A pose that turns unknown paint to the cameras is less likely than one that explains the pictures."""
+    """A pose with unknown paint towards the cameras is less likely than one that explains the pictures."""
     for sign in (1, -1):  # body z along lab -y, to the first camera, and away from it
         north = R[:1].new_tensor([[1.0, 0, 0], [0, 0, -sign], [0, sign, 0]])
         wrong = fit(pixels, 0.5, known=True, start=north.expand(len(R), 3, 3))

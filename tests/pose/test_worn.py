@@ -1,4 +1,4 @@
-"""Paint that differs from the map is found, and weighs nothing."""
+"""Paint that differs from the map is found, and has no weight."""
 
 import math
 from dataclasses import replace
@@ -39,7 +39,7 @@ def found(pixels, paint, use=USE):
     return worn_cells(pixels, fit, use, model), fit, model
 
 
-# The pictures show the map; the map that is given has a grey cap: bare paint, seen from the other side.
+# The pictures show the whole map; the given map has a grey cap, as if the paint were worn.
 CAPPED = torch.where(map_directions(len(PAINT))[..., 2] > NORTH, 0.5, PAINT.double()).float()
 
 
@@ -47,7 +47,7 @@ def test_a_worn_cap_is_found_and_nothing_else(pixels):
     worn, _, _ = found(pixels, CAPPED)
     assert worn.shape == (CELLS**2,)
     inner, outer = CELL_Z > NORTH + 0.03, CELL_Z < NORTH - 0.05
-    assert float(worn[inner].float().mean()) > 0.85  # what is left are cells on borders, grey as the cap
+    assert float(worn[inner].float().mean()) > 0.85  # the rest are cells on borders, grey as the cap
     assert float(worn[outer].float().mean()) < 0.01
 
 
@@ -75,7 +75,7 @@ def test_pictures_not_in_use_change_nothing(pixels):
     assert one.equal(other)
 
 
-def test_a_turn_of_body_and_poses_alike_turns_what_is_worn(pixels):
+def test_a_rotation_of_body_and_poses_rotates_the_worn_cells(pixels):
     """The cells are of the body: the same pictures with another body frame show the same cap elsewhere."""
     worn, fit, model = found(pixels, CAPPED)
     half = so3.exp(torch.tensor([0.0, 0.0, math.pi], dtype=torch.float64))  # about the body's z
@@ -88,7 +88,7 @@ def test_a_turn_of_body_and_poses_alike_turns_what_is_worn(pixels):
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_worn_paint_is_unknown_and_what_was_unknown_stays_so(known):
+def test_worn_paint_becomes_unknown_and_unknown_paint_stays_unknown(known):
     worn = CELL_Z > NORTH
     unseen = None if known else map_directions(len(PAINT))[..., 2] < -0.6
     paint = table(unseen=unseen)

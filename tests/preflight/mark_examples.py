@@ -1,4 +1,4 @@
-"""A server of `sphereorient mark`, asked without and with a browser."""
+"""A server of `sphereorient mark`, used without and with a browser."""
 
 import json
 import threading
@@ -35,11 +35,11 @@ def ask(url: str, content: object = None, **headers: str) -> tuple[int, bytes]:
 
 @contextmanager
 def opened(browser: Any, address: str) -> Iterator[Any]:
-    """A page of the browser in which nothing may go wrong."""
+    """A page of the browser; errors of its console fail the test."""
     page = browser.new_page(viewport={"width": 1280, "height": 800})
     wrong: list[str] = []
     page.on("pageerror", lambda error: wrong.append(str(error)))
-    page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+    page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
     page.goto(address)
     page.wait_for_function("picture !== null")
     yield page
@@ -48,7 +48,7 @@ def opened(browser: Any, address: str) -> Iterator[Any]:
 
 
 def place(page: Any, u: float, v: float) -> tuple[float, float]:
-    """Where a pixel of the picture is on the page."""
+    """Position of a picture's pixel on the page."""
     code = """([u, v]) => { const box = canvas.getBoundingClientRect(), [x, y] = toPage(u, v);
         const scale = canvas.width / box.width; return [box.left + x / scale, box.top + y / scale]; }"""
     x, y = page.evaluate(code, [u, v])

@@ -66,7 +66,7 @@ def config(tmp_path: Path, about: FicTracSetUp, more: str = "") -> Path:
     ids=["sample", "no turn", "elsewhere", "fisheye"],
 )
 @pytest.mark.parametrize("lab", ["animal", "another"])
-def test_the_table_is_what_fictracs_formulas_give_whatever_the_lab_of_the_experiment(tmp_path, about, lab):
+def test_the_table_is_that_of_fictracs_formulas_for_any_lab_of_the_experiment(tmp_path, about, lab):
     R_cam_body, turn = walked(), Rotation.from_rotvec(-about.c2a_r if lab == "animal" else [1.0, 2.0, 0.5])
     R_cam_lab = turn.as_matrix()
     axes = fictrac_axes(camera(R_cam_lab), config(tmp_path, about))
@@ -86,16 +86,16 @@ def test_the_table_is_what_fictracs_formulas_give_whatever_the_lab_of_the_experi
 def test_the_stated_line_of_sight_goes_before_the_limb(tmp_path):
     ahead = np.array([0.3, -0.1, 0.95])
     text = ", ".join(map(str, ahead))
-    said = config(tmp_path, SET_UP, f"roi_c : {{ {text} }}\nroi_r : 0.12\n")
-    axes = fictrac_axes(camera(np.eye(3)), said)
+    parsed = config(tmp_path, SET_UP, f"roi_c : {{ {text} }}\nroi_r : 0.12\n")
+    axes = fictrac_axes(camera(np.eye(3)), parsed)
     towards = axes.R_cam_own @ axes.R_own_lab @ (ahead / np.linalg.norm(ahead))
     np.testing.assert_allclose(towards, [0.0, 0.0, 1.0], atol=1e-9)  # FicTrac's camera looks at the ball
 
 
 def test_a_ball_on_the_axis_changes_nothing(tmp_path):
-    said = config(tmp_path, SET_UP, "roi_c : { 0, 0, 1 }\nroi_r : 0.12\n")
+    parsed = config(tmp_path, SET_UP, "roi_c : { 0, 0, 1 }\nroi_r : 0.12\n")
     R_cam_lab = Rotation.from_rotvec(-SET_UP.c2a_r).as_matrix()
-    axes = fictrac_axes(camera(R_cam_lab), said)
+    axes = fictrac_axes(camera(R_cam_lab), parsed)
     np.testing.assert_allclose(axes.R_own_lab, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(axes.R_cam_own, FicTracAxes.of_lab(R_cam_lab).R_cam_own, atol=1e-9)
 
@@ -118,7 +118,7 @@ def test_live_on_a_movie_agrees_with_fictracs_formulas(monkeypatch, capsys):
 
 
 @pytest.mark.shared
-def test_the_sample_of_fictrac_looks_where_fictrac_says(tmp_path):
+def test_the_sample_of_fictrac_has_the_rotation_of_fictrac(tmp_path):
     axes = fictrac_axes(camera(np.eye(3)), SAMPLE / "config.txt")
     towards = (axes.R_cam_own @ axes.R_own_lab).T @ [0.0, 0.0, 1.0]
     np.testing.assert_allclose(towards, [-0.22939, 0.09997, 0.96819], atol=2e-5)  # as its README has it

@@ -1,4 +1,4 @@
-"""How sure `init` is of the outline of a ball that stays in its place, partly hidden, in a holder."""
+"""Certainty of `init`'s outline of a fixed ball, partly hidden in a holder."""
 
 import math
 from pathlib import Path
@@ -21,7 +21,7 @@ NEAR = pytest.approx(CIRCLE, abs=1.2)
 
 
 def film(path: Path, hidden: float, rim: float = 1.25, animal: bool = False, wall: bool = False) -> Path:
-    """A ball that turns, in a holder that hides this share of its height and has a bright rim of a larger radius;
+    """A rotating ball, in a holder that hides this share of its height and has a bright rim of a larger radius;
     `animal`: it moves on the ball; `wall`: something beside it flickers.
     """
     random, (u, v, radius) = np.random.default_rng(1), CIRCLE
@@ -72,26 +72,26 @@ def test_an_outline_is_right_or_doubtful_or_none(tmp_path, hidden, rim):
     look = seen(film(tmp_path / "ball.npy", hidden, rim, animal=True, wall=True))
     right = look.outline is not None and look.outline.circle == NEAR
     assert right or look.doubtful or look.outline is None, look.words()
-    assert look.outline is None or look.stays, "it turns in its place"
+    assert look.outline is None or look.stays, "a ball that stays"
 
 
 def test_text_figure_and_files_name_one_outline(tmp_path):
     movie, out = film(tmp_path / "ball.npy", 0.45, rim=1.0, wall=True), tmp_path / "experiment.yaml"
     more = ["--vfov", "30", "--set", "frame_rate=100", "--set", "sphere.diameter=null"]
-    said = CliRunner().invoke(app, ["init", str(movie), "--out", str(out), *more]).output
+    printed = CliRunner().invoke(app, ["init", str(movie), "--out", str(out), *more]).output
     look = seen(movie)
     assert look.doubtful
     assert look.outline is not None
-    assert f"ball of {2 * look.outline.radius_px:.1f} px" in said
+    assert f"ball of {2 * look.outline.radius_px:.1f} px" in printed
     assert look.diameter_px == pytest.approx(2 * look.outline.radius_px)
-    assert "DOUBTFUL" in said
-    assert f"sphereorient mark {out}" in said
-    assert "write in experiment.yaml: circles" in said, "without it the ball is not found"
+    assert "DOUBTFUL" in printed
+    assert f"sphereorient mark {out}" in printed
+    assert "write in experiment.yaml: circles" in printed, "without it the ball is not found"
     out.write_text(out.read_text().replace("#circles", "circles"))
     assert load_experiment(out).circles["cam1"] == pytest.approx(look.outline.circle, abs=0.06)
 
 
-def test_a_given_circle_agrees_or_its_difference_is_said_and_the_picture_counts(tmp_path):
+def test_a_given_circle_agrees_or_its_difference_is_reported_and_the_picture_counts(tmp_path):
     look = seen(film(tmp_path / "ball.npy", 0.2))
     u, v, radius = CIRCLE
     right, wrong = with_circle(look, (u, v + 1, radius - 1)), with_circle(look, (u, v - 12, 0.67 * radius))

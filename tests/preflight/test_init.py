@@ -1,4 +1,4 @@
-"""`sphereorient init`: what it measures, what it writes, and that the files it writes are read."""
+"""`sphereorient init`: its measurements and the files that it writes, which are read back."""
 
 import math
 import re
@@ -44,7 +44,7 @@ vfov             : 45
 
 
 def init(*arguments: object) -> str:
-    """Run the command as a user does, without a terminal; return what it prints."""
+    """Run the command as a user does, without a terminal; return its output."""
     run = CliRunner().invoke(app, ["init", *map(str, arguments)])
     if isinstance(run.exception, SphereOrientError):
         raise run.exception
@@ -53,7 +53,7 @@ def init(*arguments: object) -> str:
 
 
 def no_ball(folder: Path, name: str = "empty.npy") -> Path:
-    """A movie that shows nothing: what is not of the look need not wait for one."""
+    """A movie of noise, for tests that need no ball."""
     np.save(folder / name, np.random.default_rng(0).integers(20, 24, (40, 48, 64)).astype(np.uint8))
     return folder / name
 
@@ -67,8 +67,8 @@ def two_movies(clean: Example, folder: Path) -> list[Path]:
 
 @pytest.mark.slow
 def test_two_movies_become_an_experiment(clean, tmp_path):
-    said = init(*two_movies(clean, tmp_path), "--out", tmp_path / "experiment.yaml", *ROUND, "-q")
-    assert said == ""
+    printed = init(*two_movies(clean, tmp_path), "--out", tmp_path / "experiment.yaml", *ROUND, "-q")
+    assert printed == ""
     with pytest.raises(CameraError, match=r"cameras.yaml.*`sphereorient calibrate`"):
         load_experiment(tmp_path / "experiment.yaml")
     (tmp_path / "cameras.yaml").symlink_to(clean.folder / "cameras.yaml")
@@ -78,10 +78,10 @@ def test_two_movies_become_an_experiment(clean, tmp_path):
     assert cv2.imread(str(tmp_path / "experiment.png")) is not None
 
 
-def test_what_nobody_knows_is_asked_for_by_name_and_refused_at_once(clean, tmp_path):
-    said = init(*two_movies(clean, tmp_path), "--out", tmp_path / "experiment.yaml")
-    assert re.findall(r"write in experiment.yaml: ([\w.]+),", said) == ["frame_rate", "sphere.diameter"]
-    assert "moves, found in" in said
+def test_unknown_values_are_requested_by_name_in_one_refusal(clean, tmp_path):
+    printed = init(*two_movies(clean, tmp_path), "--out", tmp_path / "experiment.yaml")
+    assert re.findall(r"write in experiment.yaml: ([\w.]+),", printed) == ["frame_rate", "sphere.diameter"]
+    assert "moves, found in" in printed
     with pytest.raises(ExperimentError, match=r"frame_rate or times, sphere\.diameter"):
         load_experiment(tmp_path / "experiment.yaml")
 
@@ -96,17 +96,17 @@ def test_the_look_measures_the_ball(clean, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_look_knows_a_ball_that_stays(tmp_path):
+def test_the_look_finds_a_ball_that_stays(tmp_path):
     settings = SynthSettings(frames=40, image_size=(200, 200), diameter_px=60.0, velocity_rms=0.0, volume_mm=1e-3)
     write_synthetic_experiment(tmp_path, settings)
     (look,) = look_at([tmp_path / "cam1.mkv"])
     assert look.stays is True
     assert look.diameter_px == pytest.approx(60.0, rel=0.05)
-    said = init(tmp_path / "cam1.mkv", "--out", tmp_path / "new.yaml")
-    assert "fixed, outline" in said
+    printed = init(tmp_path / "cam1.mkv", "--out", tmp_path / "new.yaml")
+    assert "fixed, outline" in printed
 
 
-def test_a_movie_without_a_ball_says_so(tmp_path):
+def test_a_movie_without_a_ball_is_reported(tmp_path):
     (look,) = look_at([no_ball(tmp_path)])
     assert look.diameter_px is None
     assert "no ball was found" in init(tmp_path / "empty.npy", "--out", tmp_path / "experiment.yaml")
@@ -120,7 +120,7 @@ def leaves(model: type[BaseModel], before: str = "") -> Iterator[str]:
 
 
 def look(folder: Path) -> FirstLook:
-    """What a movie of noise shows, as if a ball of 80 px moved in it."""
+    """A movie of noise, with a look as if a ball of 80 px moved in it."""
     np.save(folder / "a.npy", np.zeros((40, 48, 64), np.uint8))
     movie = open_movie(folder / "a.npy")
     frame = {"found": 40, "looked": 40, "frame": 0, "picture": np.zeros((48, 64)), "outline": None}
@@ -181,8 +181,8 @@ def test_a_folder_of_plates_becomes_a_calibration(tmp_path):
     folder, plate = plates(tmp_path / "plates", scenes), Scene().plate
     out = tmp_path / "calibration.yaml"
     known = [f"plate.pitch={plate.pitch_mm}", "pixel_pitch=[0.02, 0.02]", "surveyed.T_lab_plate=[0, 0, 0]"]
-    said = init("--plate", folder, "--out", out, *(word for text in known for word in ("--set", text)))
-    assert re.findall(r"write in calibration.yaml: ([\w.]+),", said) == ["surveyed.R_lab_plate"]
+    printed = init("--plate", folder, "--out", out, *(word for text in known for word in ("--set", text)))
+    assert re.findall(r"write in calibration.yaml: ([\w.]+),", printed) == ["surveyed.R_lab_plate"]
     with pytest.raises(CameraError, match=r"surveyed\.R_lab_plate"):
         load_calibration(out)
     known.append("surveyed.R_lab_plate=[[1,0,0],[0,1,0],[0,0,1]]")
@@ -197,7 +197,7 @@ def test_a_folder_of_plates_becomes_a_calibration(tmp_path):
     }
 
 
-def test_all_missing_keys_of_a_calibration_are_told_at_once(tmp_path):
+def test_all_missing_keys_of_a_calibration_are_reported_at_once(tmp_path):
     out = tmp_path / "calibration.yaml"
     init("--plate", plates(tmp_path / "plates", [Scene()]), "--out", out, "-q")
     with pytest.raises(CameraError) as refused:
@@ -218,18 +218,18 @@ def test_plate_pictures_are_paired_by_number(tmp_path):
         numbered_pictures(tmp_path / "nowhere")
 
 
-def test_a_folder_without_plates_is_told(tmp_path):
+def test_a_folder_without_plates_is_reported(tmp_path):
     cv2.imwrite(str(tmp_path / "a1.png"), np.full((100, 120), 90, np.uint8))
-    said = init("--plate", tmp_path, "--out", tmp_path / "calibration.yaml")
-    assert "no dots found in 1 pictures" in said
+    printed = init("--plate", tmp_path, "--out", tmp_path / "calibration.yaml")
+    assert "no dots found in 1 pictures" in printed
 
 
 def test_fictrac_is_taken_over(clean, tmp_path):
     two_movies(clean, tmp_path)
     (tmp_path / "config.txt").write_text(CONFIG)
-    said = read_fictrac_config(tmp_path / "config.txt")
-    assert said.circle_px == pytest.approx((0.0, 0.0, 10.0), abs=1e-9)
-    assert [len(one) for one in said.ignored] == [3, 4]
+    fictrac = read_fictrac_config(tmp_path / "config.txt")
+    assert fictrac.circle_px == pytest.approx((0.0, 0.0, 10.0), abs=1e-9)
+    assert [len(one) for one in fictrac.ignored] == [3, 4]
     init("--from-fictrac", tmp_path / "config.txt", "--out", tmp_path / "experiment.yaml")
     experiment = load_experiment(tmp_path / "experiment.yaml")
     camera = experiment.cameras["cam1"]
@@ -244,7 +244,7 @@ def test_fictrac_is_taken_over(clean, tmp_path):
     assert mask[10, 10] == 255
 
 
-def test_a_camera_of_fictrac_wants_a_movie_of_the_set_up_and_is_the_source_of_live(clean, tmp_path):
+def test_a_camera_of_fictrac_needs_a_movie_of_the_set_up_and_is_the_source_of_live(clean, tmp_path):
     movie, _ = two_movies(clean, tmp_path)
     config, out = tmp_path / "config.txt", tmp_path / "experiment.yaml"
     config.write_text(CONFIG.replace("src_fn           : cam1.mkv", "src_fn           : 2"))
@@ -253,8 +253,8 @@ def test_a_camera_of_fictrac_wants_a_movie_of_the_set_up_and_is_the_source_of_li
     with pytest.raises(SettingsError, match="expected one movie, got 2"):
         init(movie, movie, "--from-fictrac", config, "--out", out)
     assert not out.exists()
-    said = init(movie, "--from-fictrac", config, "--out", out)
-    assert f"sphereorient live {out} --source camera:2" in said
+    printed = init(movie, "--from-fictrac", config, "--out", out)
+    assert f"sphereorient live {out} --source camera:2" in printed
     experiment = load_experiment(out)
     assert experiment.movie_paths["cam1"] == movie
     assert float(experiment.cameras["cam1"].f_px) == pytest.approx(120.0 / math.tan(math.radians(22.5)))
@@ -281,14 +281,14 @@ def test_a_wrong_config_is_refused_by_its_key(tmp_path, line, message):
 
 
 def test_fictracs_own_rotation_comes_from_its_corners(tmp_path):
-    """The sample's config holds both: corners in a picture of 384 x 288 px, and what configGui made of them."""
+    """The sample's config holds both: corners in a picture of 384 x 288 px, and configGui's rotation from them."""
     text = CONFIG.replace("c2a_r            : { 0.72, -0.13, -0.46 }", "c2a_src : c2a_cnrs_xy")
     text += "c2a_cnrs_xy      : { 191, 171, 128, 272, 20, 212, 99, 132 }\nc2a_t : { -0.67, 0.39, 2.89 }\n"
     (tmp_path / "config.txt").write_text(text)
-    said = read_fictrac_config(tmp_path / "config.txt")
+    fictrac = read_fictrac_config(tmp_path / "config.txt")
     theirs = so3.exp(torch.tensor([0.722445, -0.131314, -0.460878], dtype=torch.float64))
-    assert math.degrees(float(so3.log(theirs.mT @ said.R_animal_cam((384, 288))).norm())) < 0.001
-    assert said.unread == ("c2a_t",)
+    assert math.degrees(float(so3.log(theirs.mT @ fictrac.R_animal_cam((384, 288))).norm())) < 0.001
+    assert fictrac.unread == ("c2a_t",)
 
 
 @pytest.mark.parametrize("fisheye", [False, True])
@@ -347,8 +347,8 @@ def test_every_key_of_fictrac_is_used_or_named(clean, tmp_path):
     others += " c2a_cnrs_xy c2a_cnrs_yz c2a_cnrs_xz c2a_src c2a_t roi_c roi_r"
     text = CONFIG + "fisheye : n\nthr_rgb_tfrm : grey\n% vfov : 90\n"
     (tmp_path / "config.txt").write_text(text + "".join(f"{key} : 1\n" for key in others.split()))
-    said = init("--from-fictrac", tmp_path / "config.txt", "--out", tmp_path / "experiment.yaml")
-    (line,) = [line for line in said.splitlines() if "not read: " in line]
+    printed = init("--from-fictrac", tmp_path / "config.txt", "--out", tmp_path / "experiment.yaml")
+    (line,) = [line for line in printed.splitlines() if "not read: " in line]
     assert line.partition("not read: ")[2].split(", ") == others.split()
     assert not used & set(others.split())
 
@@ -364,7 +364,7 @@ def test_fictracs_fisheye_has_one_angle_for_every_pixel(clean, tmp_path):
     assert camera.f_px.tolist() == pytest.approx([height_px / math.radians(190)] * 2)
 
 
-def test_init_replaces_its_own_file_until_somebody_changes_it(tmp_path):
+def test_init_replaces_its_own_file_until_a_user_changes_it(tmp_path):
     movie, out = no_ball(tmp_path), tmp_path / "experiment.yaml"
     init(movie, "--out", out)
     first = out.read_text()
@@ -386,7 +386,7 @@ def test_half_a_pose_is_refused(tmp_path):
         load_cameras(tmp_path / "cameras.yaml")
 
 
-def test_a_movie_in_place_of_an_experiment_is_told(clean):
+def test_a_movie_in_place_of_an_experiment_is_reported(clean):
     with pytest.raises(ExperimentError, match=r"got a movie; .*`sphereorient init"):
         load_experiment(clean.folder / "cam1.mkv")
 
@@ -452,7 +452,7 @@ def test_a_draft_that_an_editor_changed_is_known_as_that_of_init(tmp_path, chang
         init(movie, "--out", out)
 
 
-def test_a_rate_that_fictrac_does_not_give_is_said(tmp_path):
+def test_a_rate_that_fictrac_does_not_give_is_reported(tmp_path):
     config, text = tmp_path / "config.txt", CONFIG.replace("cam1.mkv", no_ball(tmp_path).name)
     config.write_text(text)
     more = ("--from-fictrac", config, "--out", tmp_path / "experiment.yaml")

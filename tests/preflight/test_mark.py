@@ -1,4 +1,4 @@
-"""`sphereorient mark`: what is drawn becomes the mask, in a browser as well; and who may ask."""
+"""`sphereorient mark`: drawn shapes become the mask, also in a browser; requests need the token."""
 
 import base64
 import json
@@ -86,7 +86,7 @@ def test_a_mirrored_movie_keeps_its_mask_where_it_was_drawn(clean, tmp_path, how
     experiment = load_experiment(marking.path)
     file = cv2.imread(str(experiment.mask_paths["cam1"]), cv2.IMREAD_GRAYSCALE)
     drawn = drawn_mask((240, 240), [TRIANGLE], None)
-    assert np.array_equal(file > 127, drawn[::-1] if how == "vertical" else drawn.T)  # as the file of the movie lies
+    assert np.array_equal(file > 127, drawn[::-1] if how == "vertical" else drawn.T)  # as in the file
     assert np.array_equal(given_mask(experiment, "cam1", (240, 240)), drawn)
 
 
@@ -110,7 +110,7 @@ def test_a_key_of_several_lines_is_left_alone(marking):
     assert marking.path.read_text() == text
 
 
-def test_the_server_answers_who_knows_the_token(marking, address):
+def test_the_server_answers_requests_with_the_token(marking, address):
     mine = f"{address}/{marking.token}"
     assert ask(f"{mine}/")[0] == 200
     assert json.loads(ask(f"{mine}/state")[1])["cameras"][0]["frames"] == 64
@@ -121,26 +121,26 @@ def test_the_server_answers_who_knows_the_token(marking, address):
 
 
 def test_the_map_is_laid_on_the_ball_as_it_lies_there(marking):
-    """The re-rendered ball looks like the picture, in its place."""
-    said = marking.rendered("cam1")
-    assert said["explained"] > 60
-    content = np.frombuffer(base64.b64decode(said["picture"].partition(",")[2]), np.uint8)
+    """The re-rendered ball looks like the picture, at its position."""
+    answer = marking.rendered("cam1")
+    assert answer["explained"] > 60
+    content = np.frombuffer(base64.b64decode(answer["picture"].partition(",")[2]), np.uint8)
     picture = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
-    shown = marking.movies["cam1"].sample([said["frame"]])[0].astype(float)
+    shown = marking.movies["cam1"].sample([answer["frame"]])[0].astype(float)
     assert picture.shape == (*shown.shape, 4)
     inside = picture[..., 3] > 0
-    assert abs(inside.sum() / (np.pi * said["radius"] ** 2) - 1) < 0.05
+    assert abs(inside.sum() / (np.pi * answer["radius"] ** 2) - 1) < 0.05
     assert np.corrcoef(picture[..., 0][inside], shown[inside])[0, 1] > 0.6
 
 
-def test_without_a_map_it_says_how_to_learn_one(marking):
+def test_without_a_map_it_prints_how_to_learn_one(marking):
     marking.experiment.texture_path.unlink()
     with pytest.raises(ExperimentError, match="learn it: `sphereorient map"):
         marking.rendered("cam1")
 
 
 @pytest.mark.parametrize("path", ["/", "/state", "/wrong/state", "/{token}", "/{token}/nothing", "/{token}/../state"])
-def test_others_get_nothing(marking, address, path):
+def test_requests_without_the_token_get_nothing(marking, address, path):
     assert ask(address + path.format(token=marking.token))[0] == 404
 
 
@@ -158,11 +158,11 @@ def test_a_page_of_another_host_gets_nothing(marking, address):
         ("save/cam1", [1], "shapes and keep"),
     ],
 )
-def test_a_wrong_request_is_told_and_changes_nothing(marking, address, path, content, words):
+def test_a_wrong_request_is_reported_and_changes_nothing(marking, address, path, content, words):
     before = sorted(marking.path.parent.iterdir())
-    status, said = ask(f"{address}/{marking.token}/{path}", content)
+    status, answer = ask(f"{address}/{marking.token}/{path}", content)
     assert status == 400
-    assert words in json.loads(said)["error"]
+    assert words in json.loads(answer)["error"]
     assert sorted(marking.path.parent.iterdir()) == before
 
 

@@ -78,13 +78,13 @@ def test_the_state_of_a_picture_and_why(address):
 
 def test_clicked_fiducials_are_tried_then_saved_and_the_rest_of_the_file_stays(marking, address):
     points = clicks(*PLATE.fiducials)
-    said = json.loads(ask(f"{address}/try/1", {"points": points})[1])
-    assert (said["tied"], len(said["points"])) == (True, 94)
+    answer = json.loads(ask(f"{address}/try/1", {"points": points})[1])
+    assert (answer["tied"], len(answer["points"])) == (True, 94)
     assert marking.path.read_text() == FILE
     assert ask(f"{address}/save/1", {"points": points})[0] == 200
     line = f"    clicked: {{cam1: {points}}}\n"
     assert marking.path.read_text() == FILE.replace("# dusty\n", f"# dusty\n{line}")
-    assert ask(f"{address}/save/0", {"points": said["points"][:2]})[0] == 400
+    assert ask(f"{address}/save/0", {"points": answer["points"][:2]})[0] == 400
     # What calibrate reads then is tied, and every dot is where it was drawn.
     views = see_pictures(load_calibration(marking.path), lambda stage, done, total: None)
     view = next(view for picture, view in views.items() if picture.row == 1)
@@ -116,14 +116,14 @@ def test_a_saved_picture_can_be_clicked_again(marking):
         ("view/7", None, "0 .. 1"),
     ],
 )
-def test_a_wrong_request_is_told_and_changes_nothing(marking, address, path, content, words):
-    status, said = ask(f"{address}/{path}", content)
+def test_a_wrong_request_is_reported_and_changes_nothing(marking, address, path, content, words):
+    status, answer = ask(f"{address}/{path}", content)
     assert status == 400
-    assert words in json.loads(said)["error"]
+    assert words in json.loads(answer)["error"]
     assert marking.path.read_text() == FILE
 
 
-def test_a_file_that_cannot_be_changed_safely_stays_and_what_to_write_is_told(marking):
+def test_a_file_that_cannot_be_changed_safely_stays_and_what_to_write_is_reported(marking):
     changed = FILE.replace("# dusty\n", "\n    clicked:\n      # by hand\n      cam1: [[1, 2], [3, 4]]\n")
     marking.path.write_text(changed)
     points = clicks(*PLATE.fiducials)
@@ -179,7 +179,7 @@ def test_a_person_clicks_the_fiducials(marking, address, browser: Any, tmp_path:
 
 
 @pytest.mark.parametrize(("name", "kind"), [("calibration.yaml", FiducialMarking), ("experiment.yaml", MaskMarking)])
-def test_the_command_tells_the_files_apart(marking, name, kind, monkeypatch):
+def test_the_command_distinguishes_the_files(marking, name, kind, monkeypatch):
     seen = []
 
     def begin(self, path: Path) -> None:
@@ -191,6 +191,6 @@ def test_the_command_tells_the_files_apart(marking, name, kind, monkeypatch):
     path = marking.path.with_name(name)
     if kind is MaskMarking:
         path.write_text("schema: sphereorient-experiment/1\n")
-    said = CliRunner().invoke(app, ["mark", str(path), "--no-browser"])
+    answer = CliRunner().invoke(app, ["mark", str(path), "--no-browser"])
     assert seen == [path]
-    assert "expected a free port" in str(said.exception)
+    assert "expected a free port" in str(answer.exception)

@@ -29,7 +29,7 @@ def test_the_excerpt_passes_and_its_figure_lies_here(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_fault_ends_with_1_and_says_what_to_do(clean, tmp_path):
+def test_a_fault_ends_with_1_and_advice(clean, tmp_path):
     shifted = replace(clean, pictures={"cam1": clean.pictures["cam1"][3:], "cam2": clean.pictures["cam2"][:-3]})
     path = write(shifted, tmp_path / "experiment")
     run = check(tmp_path, path, "--out", "seen.png", "--quiet")
@@ -48,7 +48,7 @@ def test_a_figure_that_cannot_be_written_is_refused_before_the_work(clean, tmp_p
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["one camera", "no ball", "painted"])
-def test_the_figure_is_drawn_whatever_is_missing(clean, tmp_path, case):
+def test_the_figure_is_drawn_with_any_part_missing(clean, tmp_path, case):
     keys = {}
     example = clean
     if case == "one camera":

@@ -1,4 +1,4 @@
-"""The measures of the check against oracles: outlines, blur, gaps, what start: must say."""
+"""The measures of the check against oracles: outlines, blur, gaps, the value of start:."""
 
 import math
 from pathlib import Path
@@ -58,7 +58,7 @@ def test_the_expected_outline_encloses_the_spheres_picture_and_touches_it(camera
     assert got == pytest.approx(np.linalg.norm(hull - middle, axis=1).mean(), abs=0.03)
 
 
-def test_the_gap_is_that_of_triangulation_and_its_sign_tells_the_side():
+def test_the_gap_is_that_of_triangulation_and_its_sign_gives_the_side():
     uv = [f64([[150.0, 140.0], [160.0, 150.0]]), f64([[153.0, 120.0], [157.0, 170.0]])]
     gaps = gaps_between([ALONG_Y, DOWN_Z], uv)
     _, expected = triangulate(ALONG_Y.rays(uv[0]), DOWN_Z.rays(uv[1]))
@@ -101,10 +101,10 @@ def test_the_least_gap_is_at_the_planted_offset(late):
 def test_a_knock_does_not_hide_the_offset_where_the_motion_varies(late):
     steps = steps_of(late, knock_px=40.0)
     assert steps.shift == late
-    assert steps.in_step_px > 30  # and what the knock leaves stays visible
+    assert steps.in_step_px > 30  # and the error of the knock stays visible
 
 
-def test_a_ball_that_hardly_moves_tells_nothing():
+def test_a_ball_that_hardly_moves_gives_no_step():
     assert math.isnan(steps_of(2, moving=0.02).best)
 
 
@@ -152,7 +152,7 @@ def test_a_picture_holds_a_disk_that_touches_its_border_and_none_that_passes_it(
     assert holds_disk(ALONG_Y, centre, f64([30.0] * 5)).tolist() == [True, False, True, False, False]
 
 
-def test_disks_that_the_border_cuts_tell_nothing_of_motion_blur():
+def test_disks_that_the_border_cuts_give_no_motion_blur():
     still = motion_blur(sample_of(150.0, 152.0, 5.0, 290.0, 100.0, 101.0), 0.5, 1.0)
     assert still.severity is OK
     assert "1.50 px a frame" in still.measured
@@ -207,7 +207,7 @@ def test_rows_are_read_in_order_with_gaps_where_there_is_no_picture():
     assert read == [3, 4, 5, None, None, 8, 20, None, None, 30]
 
 
-def test_a_telecentric_camera_expects_its_own_scale():
+def test_a_telecentric_camera_expects_a_disk_at_its_own_scale():
     camera = TelecentricCamera(
         image_size=(300, 300),
         scale_mm_px=f64(0.25),
@@ -245,7 +245,7 @@ def scans_of(best: dict[str, float]) -> list[OffsetScan]:
     ],
     ids=["the last", "the first", "one that is early"],
 )
-def test_of_three_movies_the_one_out_of_step_is_named(late, start):
+def test_the_one_of_three_movies_out_of_step_is_named(late, start):
     found = in_step(scans_of(late), {})
     assert found.severity is FAULT
     wrong = {"cam3: 1}": "cam3", "cam1: 1,": "cam1"}
@@ -253,5 +253,5 @@ def test_of_three_movies_the_one_out_of_step_is_named(late, start):
     assert found.advice == start
 
 
-def test_three_movies_in_step_are_left_in_peace():
+def test_three_movies_in_step_get_no_finding():
     assert in_step(scans_of({"cam1": 0.0, "cam2": 0.03, "cam3": -0.02}), {}).severity is OK

@@ -1,4 +1,4 @@
-"""Faults of pictures, light and files are told; whatever an experiment lacks, the check goes on."""
+"""Faults of pictures, light and files are reported; the check goes on whatever an experiment lacks."""
 
 import re
 import shutil
@@ -34,11 +34,11 @@ def test_without_pictures_of_the_empty_scene_it_is_learnt(clean, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gain", [1.8, 3.0])
-def test_a_saturated_movie_is_told(clean, tmp_path, gain):
+def test_a_saturated_movie_is_reported(clean, tmp_path, gain):
     result = checked(clean.spoilt(lambda movie: np.clip(15 + (movie - 15.0) * gain, 0, 255)), tmp_path)
-    told = [one for one in result.findings if one.severity is not OK and "saturated" in one.measured]
-    assert told
-    assert all("expose shorter" in one.advice for one in told)
+    saturated = [one for one in result.findings if one.severity is not OK and "saturated" in one.measured]
+    assert saturated
+    assert all("expose shorter" in one.advice for one in saturated)
 
 
 @pytest.mark.slow
@@ -50,13 +50,13 @@ def test_a_movie_wholly_white_is_a_fault_and_no_crash(clean, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_dim_movie_is_told(clean, tmp_path):
+def test_a_dim_movie_is_reported(clean, tmp_path):
     dim = clean.spoilt(lambda movie: np.rint(15 + (movie - 15.0) * 0.1))
     assert of(checked(dim, tmp_path), "exposure cam1").severity is WARNING
 
 
 @pytest.mark.slow
-def test_of_movies_without_a_ball_one_line_a_camera_is_told(clean, tmp_path):
+def test_movies_without_a_ball_give_one_line_a_camera(clean, tmp_path):
     def empty(movie: np.ndarray) -> np.ndarray:
         return np.clip(np.random.default_rng(1).normal(15.0, 2.0, movie.shape).round(), 0, 255)
 
@@ -99,7 +99,7 @@ def test_a_ball_that_passes_by_in_few_frames_is_found(clean, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_movie_out_of_focus_is_told(clean, tmp_path):
+def test_a_movie_out_of_focus_is_reported(clean, tmp_path):
     soft = clean.spoilt(lambda movie: np.stack([cv2.GaussianBlur(one, (0, 0), 2.0) for one in movie]))
     assert of(checked(soft, tmp_path), "sharpness cam1").severity is WARNING
 
@@ -133,8 +133,8 @@ def test_a_ball_of_unknown_size_is_measured_and_the_setting_named(clean, tmp_pat
     assert found.severity is WARNING
     size = int(found.advice.split("diameter_px to ")[1].split()[0])
     assert size == pytest.approx(56, abs=4)
-    told = of(preflight(path, load_settings(None, [f"locate.diameter_px={size}"])), "size of the ball, cam1")
-    assert told.severity is OK
+    finding = of(preflight(path, load_settings(None, [f"locate.diameter_px={size}"])), "size of the ball, cam1")
+    assert finding.severity is OK
 
 
 @pytest.mark.slow
@@ -148,7 +148,7 @@ def test_a_fixed_ball_is_better_off_with_pictures_without_it(clean, tmp_path):
     assert of(without, "ball cam1").severity is OK
 
 
-def test_a_ball_in_its_place_that_nobody_finds_is_looked_for_where_the_mask_shows_it(clean, tmp_path):
+def test_a_fixed_ball_that_is_not_found_is_searched_where_the_mask_shows_it(clean, tmp_path):
     path = write(
         clean, tmp_path, backgrounds=None, masks={"cam1": "mask.png"}, sphere={"diameter": 18.0, "fixed": True}
     )
@@ -162,14 +162,14 @@ def test_a_ball_in_its_place_that_nobody_finds_is_looked_for_where_the_mask_show
 
 
 @pytest.mark.slow
-def test_movies_of_unequal_length_are_told(clean, tmp_path):
+def test_movies_of_unequal_length_are_reported(clean, tmp_path):
     result = checked(clean.spoilt(lambda movie: movie[:50], ("cam2",)), tmp_path)
     assert of(result, "frames").severity is WARNING
     assert of(result, "lines of sight").severity is OK
 
 
 @pytest.mark.slow
-def test_files_outside_the_folder_are_told(clean, tmp_path):
+def test_files_outside_the_folder_are_reported(clean, tmp_path):
     path = write(clean, tmp_path / "inside", cameras="../cameras.yaml")
     (tmp_path / "cameras.yaml").write_text((tmp_path / "inside" / "cameras.yaml").read_text())
     found = of(preflight(path), "files elsewhere")
@@ -202,7 +202,7 @@ def test_check_invents_no_fault_of_what_track_measures(name):
 
 @pytest.mark.shared
 @pytest.mark.slow
-def test_check_looks_at_a_held_ball_as_track_does_whatever_its_paint(tmp_path):
+def test_check_looks_at_a_held_ball_as_track_does_with_any_paint(tmp_path):
     for name in ("config.txt", "sample.mp4"):
         shutil.copy(SHARED / "real" / "fictrac" / name, tmp_path)
     run = partial(subprocess.run, cwd=tmp_path, check=True, capture_output=True, text=True)

@@ -1,4 +1,4 @@
-"""A fault of the cameras is planted, and the check names it and what mends it; a clean experiment is left in peace."""
+"""The check names planted faults of cameras and their remedy; a clean experiment gets no finding."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +30,7 @@ def test_a_movie_that_began_two_frames_early_is_found_and_the_start_that_mends_i
     found = of(result, "movies in step")
     assert found.severity is FAULT
     assert start in found.advice
-    assert of(result, "lines of sight").severity is OK  # once they are in step: the cameras are not to blame
+    assert of(result, "lines of sight").severity is OK  # once they are in step: no fault of the cameras
     mended = checked(early, tmp_path / "mended", start=yaml.safe_load(start), frames=[0, 60])
     assert of(mended, "movies in step").severity is OK
 
@@ -43,7 +43,7 @@ def test_a_wrong_start_is_put_right(clean, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_ball_at_rest_cannot_tell_the_step(clean, tmp_path):
+def test_a_ball_at_rest_does_not_give_the_step(clean, tmp_path):
     def rest(movie: np.ndarray) -> np.ndarray:
         return movie[:1] + np.arange(len(movie))[:, None, None] % 2  # or the pictures would be repeated ones
 
@@ -54,7 +54,7 @@ def test_a_ball_at_rest_cannot_tell_the_step(clean, tmp_path):
 
 
 def turned(folder: Path, name: str, deg: float) -> None:
-    """Turn a camera about its vertical axis, as a knock does."""
+    """Rotate a camera about its vertical axis, as a knock does."""
     document = yaml.safe_load((folder / "cameras.yaml").read_text())
     camera = document["cameras"][name]
     c, s = np.cos(np.deg2rad(deg)), np.sin(np.deg2rad(deg))
@@ -84,7 +84,7 @@ def test_swapped_movies_are_named(clean, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("keys", "named"), [({"diameter": 18.9}, ", not 18.9"), ({}, "")])
-def test_what_explains_a_contradiction_is_named(clean, tmp_path, keys, named):
+def test_the_cause_of_a_contradiction_is_named(clean, tmp_path, keys, named):
     """Before: a diameter 5 % off gave a warning of the size only."""
     found = of(checked(clean, tmp_path, sphere=PAINTED | keys), "cameras agree")
     assert found.severity is (FAULT if named else OK), found.measured
@@ -112,7 +112,7 @@ def test_a_mirrored_movie_is_named(clean, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_movie_mirrored_left_to_right_is_told_by_the_lines_of_sight(clean, tmp_path):
+def test_a_movie_mirrored_left_to_right_is_found_by_the_lines_of_sight(clean, tmp_path):
     result = checked(clean.spoilt(lambda movie: movie[:, :, ::-1], ("cam1",)), tmp_path)
     found = of(result, "lines of sight")
     assert found.severity is FAULT
@@ -129,7 +129,7 @@ def test_a_wrong_diameter_is_found_and_the_right_one_named(clean, tmp_path, wron
 
 
 @pytest.mark.slow
-def test_one_wrong_focal_length_is_laid_to_its_camera(clean, tmp_path):
+def test_a_wrong_focal_length_is_found_in_its_own_camera(clean, tmp_path):
     path = write(clean, tmp_path)
     document = yaml.safe_load((tmp_path / "cameras.yaml").read_text())
     document["cameras"]["cam2"]["f"] *= 1.1

@@ -68,13 +68,13 @@ def test_the_random_paints_are_good(kind):
         (lambda map_: (map_directions(256)[..., 2] > 0).float(), RADIUS_PX, "smaller patches"),
     ],
 )
-def test_what_is_wrong_with_a_paint_is_named(good, spoil, radius_px, words):
+def test_faults_of_a_paint_are_named(good, spoil, radius_px, words):
     found = judge_contrast(measure_texture(spoil(good)), radius_px)
     assert found.severity is (FAULT if words == "one colour" else WARNING)
     assert words in found.advice
 
 
-def test_views_of_a_random_paint_can_be_told_apart(pair):
+def test_views_of_a_random_paint_can_be_distinguished(pair):
     assert look_alikes(pair).severity is OK
     assert pair.score > 0.3  # something is always a little alike
 
@@ -122,7 +122,7 @@ def test_a_map_of_one_colour_is_refused(clean, tmp_path):
 
 
 @pytest.mark.slow
-def test_of_a_map_of_nearly_one_colour_nothing_else_is_said(clean, tmp_path):
+def test_a_map_of_nearly_one_colour_has_no_other_finding(clean, tmp_path):
     faint = replace(clean, texture=(128 + clean.texture // 128).astype(np.uint8))
     result = checked(faint, tmp_path, sphere=PAINTED)
     assert of(result, "paint").severity is FAULT

@@ -1,4 +1,4 @@
-"""The check of several balls: too many or too few named, balls that are not found, sizes, and what is exchanged."""
+"""The check of several balls: too many or too few named, balls that are not found, sizes, and exchanged names."""
 
 from types import SimpleNamespace
 
@@ -51,14 +51,14 @@ def disk(x_mm: float, diameter_mm: float) -> Outline:
     return Outline(u_px=PX_PER_MM * x_mm, v_px=0.0, radius_px=PX_PER_MM * diameter_mm / 2, rms_px=0.1, coverage=0.9)
 
 
-def told(x_mm: dict[str, float | None], true_mm: dict[float, float], **named: float):
-    """The findings on sizes where balls are found at x, and disks of true diameters are there."""
+def size_findings(x_mm: dict[str, float | None], true_mm: dict[float, float], **named: float):
+    """Findings on sizes of balls found at x, with disks of true diameters."""
     seen = [disk(x, mm) for x, mm in true_mm.items()]
     found = {name: poses(x) for name, x in x_mm.items()}
     return {one.title.removeprefix("size of ball "): one for one in ball_sizes([found], [[seen, seen]], balls(**named))}
 
 
-def test_more_and_fewer_disks_than_named_balls_are_told():
+def test_more_and_fewer_disks_than_named_balls_are_reported():
     seen = [[[disk(0, 14), disk(30, 14)], [disk(0, 14)]]] * 3
     first, second = disk_counts(seen, balls(a=14.0))
     assert (first.severity, second.severity) == (WARNING, OK)
@@ -77,26 +77,26 @@ def test_a_ball_that_is_never_found_is_a_fault_and_one_found_now_and_then_a_warn
     assert "spheres.b" in b.advice
 
 
-def test_sizes_are_measured_and_wrong_ones_told_with_the_one_that_fits():
-    right = told({"a": 0.0, "b": 50.0}, {0.0: 14.0, 50.0: 20.0}, a=14.0, b=20.0)
+def test_sizes_are_measured_and_wrong_ones_reported_with_the_one_that_fits():
+    right = size_findings({"a": 0.0, "b": 50.0}, {0.0: 14.0, 50.0: 20.0}, a=14.0, b=20.0)
     assert [one.severity for one in right.values()] == [OK, OK]
-    wrong = told({"a": 0.0, "b": 50.0}, {0.0: 14.0, 50.0: 18.0}, a=14.0, b=20.0)
+    wrong = size_findings({"a": 0.0, "b": 50.0}, {0.0: 14.0, 50.0: 18.0}, a=14.0, b=20.0)
     assert [one.severity for one in wrong.values()] == [OK, FAULT]
     assert "spheres.b.diameter 18 would fit" in wrong["b"].advice
     assert wrong["b"].measured == "18 mm in the pictures, 20 mm named"
 
 
-def test_exchanged_diameters_or_maps_are_told_of_both_balls():
-    found = told({"a": 0.0, "b": 50.0}, {0.0: 14.0, 50.0: 16.0}, a=16.0, b=14.0)
+def test_exchanged_diameters_or_maps_are_reported_of_both_balls():
+    found = size_findings({"a": 0.0, "b": 50.0}, {0.0: 14.0, 50.0: 16.0}, a=16.0, b=14.0)
     assert [one.severity for one in found.values()] == [FAULT, FAULT]
     assert found["a"].advice == "the diameters, or the textures, of a and b are exchanged: correct `spheres`"
 
 
-def test_a_disk_elsewhere_says_nothing_of_a_ball():
-    assert told({"a": 0.0}, {30.0: 18.0}, a=14.0) == {}
+def test_a_disk_elsewhere_gives_no_size_of_a_ball():
+    assert size_findings({"a": 0.0}, {30.0: 18.0}, a=14.0) == {}
 
 
-def test_missing_maps_are_told_ball_by_ball(tmp_path):
+def test_missing_maps_are_reported_ball_by_ball(tmp_path):
     spheres = (Sphere(name="a", diameter_mm=14.0), Sphere(name="b", diameter_mm=14.0, texture_path=tmp_path / "t.png"))
     recording = SimpleNamespace(experiment=SimpleNamespace(spheres=spheres))
     scene, found = look_at_scene(recording, SimpleNamespace(), lambda *_: None)
@@ -107,7 +107,7 @@ def test_missing_maps_are_told_ball_by_ball(tmp_path):
 
 
 @pytest.mark.slow  # 10 s
-def test_two_maps_of_one_paint_are_told():
+def test_two_maps_of_one_paint_are_reported():
     a, b = (torch.nn.functional.avg_pool2d(random_texture("patches", seed)[None], 8)[0] for seed in (3, 4))
     turned = turned_map(a, so3.exp(torch.tensor([[0.4, -1.1, 0.7]], dtype=torch.float64))[0])
     (finding,) = same_paint({"a.png": a, "b.png": b, "c.png": turned}, silent)

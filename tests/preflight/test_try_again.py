@@ -23,7 +23,7 @@ CORNER = {"kind": "hide", "points": [[0, 0], [20, 0], [0, 20]]}
 
 @pytest.fixture(scope="module")
 def turning(tmp_path_factory) -> Path:
-    """A ball that turns in its place, of one camera, with comments in its files."""
+    """A fixed ball, of one camera, with comments in its files."""
     settings = SynthSettings(
         frames=60, image_size=(150, 150), diameter_px=56.0, volume_mm=8.0, velocity_rms=0.0, exposure=1e-4,
         exposure_samples=1, omega_rms=60.0, seed=5,
@@ -70,7 +70,7 @@ def test_mask_light_and_field_of_view_are_those_that_are_tried(marking):
     assert not list(marking.path.parent.glob("*mask*")), "nothing is written until it is saved"
 
 
-def test_what_was_tried_is_saved_and_all_else_stays(marking):
+def test_tried_values_are_saved_and_all_else_stays(marking):
     asked = NOTHING | {"circle": [75.25, 74.5, 28.0], "light": {"gamma": 2.2}, "vfov_deg": 25, "shapes": [CORNER]}
     files = marking.done(["adopt", "cam1"], asked)["files"]
     saved = load_experiment(marking.path)
@@ -97,7 +97,7 @@ def test_what_was_tried_is_saved_and_all_else_stays(marking):
         ({"shapes": [{"kind": "hide", "u": 75, "v": 75, "radius": 500}]}, "all of it hidden"),
     ],
 )
-def test_impossible_values_are_told_and_change_nothing(marking, asked, words):
+def test_impossible_values_are_reported_and_change_nothing(marking, asked, words):
     before = {path.name: path.read_bytes() for path in marking.path.parent.iterdir()}
     for what in ("track", "adopt"):
         with pytest.raises(SphereOrientError, match=words):

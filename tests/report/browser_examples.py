@@ -1,4 +1,4 @@
-"""A browser for pages; a test module asks for it with pytest_plugins = ["browser_examples"].
+"""A browser for pages; a test module uses it by pytest_plugins = ["browser_examples"].
 
 Not in a conftest.py of this folder: that would hide tests/conftest.py from all that import from it.
 """
@@ -36,12 +36,12 @@ def open_page(browser: Any) -> Callable[..., AbstractContextManager[Any]]:
 
 @contextmanager
 def opened_page(browser: Any, path: Path, width: int = 1280, **more: Any) -> Iterator[Any]:
-    """A page from disk without a network; at the end nothing may have gone wrong in it."""
+    """A page from disk without a network; errors and requests fail the test."""
     context = browser.new_context(viewport={"width": width, "height": 900}, **more)
     context.set_offline(True)
     page = context.new_page()
     wrong: list[str] = []
-    page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
+    page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: wrong.append(str(error)))
     page.on("request", lambda asked: None if asked.url.startswith(("file:", "data:")) else wrong.append(asked.url))
     page.goto(path.as_uri())

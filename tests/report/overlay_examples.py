@@ -1,4 +1,4 @@
-"""The track that a perfect tracker would write of the excerpt, for what is drawn from tracks."""
+"""The track of a perfect tracker for the excerpt, for figures of tracks."""
 
 import sys
 from dataclasses import replace
@@ -57,7 +57,7 @@ def changed(track: Trajectory, rows: slice | int, **values: object) -> Trajector
 
 
 def camera_changed(track: Trajectory, name: str, rows: slice | int, reason: str | None = None, **values: object):
-    """The same track where one camera says something else in some frames."""
+    """The same track with other values of one camera in some frames."""
     camera = track.cameras[name]
     parts: dict[str, object] = {}
     for key, value in values.items():
@@ -71,7 +71,7 @@ def camera_changed(track: Trajectory, name: str, rows: slice | int, reason: str 
 
 
 def command(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:
-    """Run the command line in this process: exit code, what it printed, what it complained of."""
+    """Run the command line in this process: exit code, output, errors."""
     monkeypatch.setattr(sys, "argv", ["sphereorient", *map(str, arguments)])
     with pytest.raises(SystemExit) as stop:
         cli.main()

@@ -1,4 +1,4 @@
-"""The picture of a track: drawn from what is true, it shows what was filmed, whatever the track lacks."""
+"""The picture of a track: drawn from the truth, it shows the filmed ball, also for tracks with gaps."""
 
 from dataclasses import replace
 
@@ -49,7 +49,7 @@ def test_without_a_truth_the_last_panel_shows_the_cameras(tmp_path, kept, names,
 
 @pytest.mark.slow
 def test_the_rerendered_sphere_looks_like_the_filmed_one(tmp_path, kept):
-    """True orientations must give the filmed paint, in the same place and neither mirrored nor turned."""
+    """True orientations must give the filmed paint, in the same place and neither mirrored nor rotated."""
     demo_figure(true_track(("cam1", "cam2")), excerpt(), tmp_path / "figure.png")
     [top, _] = kept[0].subfigs
     assert len(top.subfigs) == 2

@@ -77,7 +77,7 @@ def test_what_was_not_measured_is_nan(table):
     assert table["cam1_reason"].tolist() == ["ok"] * 40
 
 
-def test_the_csv_begins_with_what_the_track_says_of_itself(track, tmp_path):
+def test_the_csv_begins_with_the_metadata_of_the_track(track, tmp_path):
     export_track(track, tmp_path / "t.csv", "csv")
     head = [line for line in (tmp_path / "t.csv").read_text().splitlines() if line.startswith("#")]
     assert head[:2] == ["# made by sphereorient", "# experiment: of May"]
@@ -87,7 +87,7 @@ def test_the_csv_begins_with_what_the_track_says_of_itself(track, tmp_path):
     assert "#     b: 1.0e-3  # why" in head
 
 
-def test_parquet_keeps_nan_apart_from_nothing_and_says_units(track, tmp_path):
+def test_parquet_keeps_nan_apart_from_nothing_and_names_units(track, tmp_path):
     export_track(track, tmp_path / "t.parquet", "parquet")
     table = arrow_parquet.read_table(tmp_path / "t.parquet")
     assert all(table[name].null_count == 0 for name in table.column_names)
@@ -143,7 +143,7 @@ def test_a_track_without_frames_or_cameras_can_be_written(tmp_path, to):
     assert to_xarray(Trajectory.empty(np.zeros(0))).sizes["time"] == 0
 
 
-def test_long_tracks_are_written_in_parts_and_progress_is_told(tmp_path, monkeypatch, track):
+def test_long_tracks_are_written_in_parts_and_progress_is_reported(tmp_path, monkeypatch, track):
     monkeypatch.setattr("sphereorient.report.export.ROWS", 15)
     for to in ("csv", "parquet"):
         steps: list[tuple[int, int]] = []
@@ -164,9 +164,9 @@ def test_names_of_cameras_that_no_table_takes_are_made_plain():
 @pytest.mark.parametrize(("to", "package"), [("parquet", "pyarrow"), ("nc", "xarray"), ("nwb", "pynwb")])
 def test_a_missing_package_is_named_with_its_remedy(monkeypatch, track, tmp_path, to, package):
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(OutputError, match=f"package {package}, got none; .*pip install") as told:
+    with pytest.raises(OutputError, match=f"package {package}, got none; .*pip install") as error:
         export_track(track, tmp_path / f"t.{to}")
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(error.value)
     assert not list(tmp_path.iterdir())
 
 
@@ -187,7 +187,7 @@ def test_unknown_formats_are_refused(tmp_path, name, to, words):
 @pytest.mark.parametrize(
     ("name", "to", "format_"), [("t.csv", None, "csv"), ("T.PQ", None, "parquet"), ("t.txt", "csv", "csv")]
 )
-def test_the_suffix_tells_the_format_unless_told(tmp_path, name, to, format_):
+def test_the_suffix_gives_the_format_unless_an_option_does(tmp_path, name, to, format_):
     assert format_of(tmp_path / name, to) == format_
 
 
@@ -197,12 +197,12 @@ def test_the_command_writes_a_whole_file_or_one_line(track, tmp_path, monkeypatc
     assert code == 0
     assert "40 frames" in printed
     assert sorted(path.name for path in tmp_path.iterdir()) == ["t.csv", "track.h5"]
-    code, _, told = command(
+    code, _, error = command(
         monkeypatch, capsys, "export", tmp_path / "t.csv", "--to", "mat", "--out", tmp_path / "t.mat"
     )
     assert code == 2
-    assert told.count("\n") == 1
-    assert "t.csv: expected an HDF5 file" in told
+    assert error.count("\n") == 1
+    assert "t.csv: expected an HDF5 file" in error
     assert sorted(path.name for path in tmp_path.iterdir()) == ["t.csv", "track.h5"]
 
 

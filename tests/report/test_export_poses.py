@@ -37,7 +37,7 @@ def axes() -> FicTracAxes:
 
 
 def rolled(rate: torch.Tensor, frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times and orientations of a ball that turns at a constant rate (3,), rad/s, lab."""
+    """Times and orientations of a ball that rotates at a constant rate (3,), rad/s, lab."""
     time_s = np.arange(frames) / HERTZ
     return time_s, (so3.exp(torch.from_numpy(time_s)[:, None] * rate) @ so3.exp(vector(0.3, 0.2, -1.0))).numpy()
 

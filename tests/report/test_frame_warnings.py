@@ -1,4 +1,4 @@
-"""The sheet of the worst frames finds planted trouble and says what it is."""
+"""The sheet of the worst frames shows planted faults with their reasons."""
 
 import numpy as np
 import pytest
@@ -20,18 +20,18 @@ def lost(track: Trajectory, rows: slice, why: Reason = Reason.OUTLINE) -> Trajec
     return track
 
 
-def said(bad: dict[int, tuple[str, ...]]) -> dict[int, str]:
+def in_words(bad: dict[int, tuple[str, ...]]) -> dict[int, str]:
     return {k: "; ".join(words) for k, words in bad.items()}
 
 
 def test_a_gap_is_shown_at_both_edges_with_its_length_and_reason():
-    words = said(choose_worst(lost(true_track(), slice(10, 18)), 4))
+    words = in_words(choose_worst(lost(true_track(), slice(10, 18)), 4))
     assert words[10] == "gap of 8 frames begins: cam1: no clear outline, cam2: no clear outline"
     assert words[18].startswith("first frame after a gap of 8 frames")
 
 
 def test_a_gap_at_the_end_has_no_frame_after_it():
-    words = said(choose_worst(lost(true_track(), slice(30, 40)), 40))
+    words = in_words(choose_worst(lost(true_track(), slice(30, 40)), 40))
     assert "gap of 10 frames" in words[30]
     assert max(words) < 40
 
@@ -45,7 +45,7 @@ def test_every_kind_of_trouble_is_among_the_first():
     cov = np.broadcast_to(1e-6 * np.eye(3), (40, 3, 3)).copy()
     cov[25] *= 400
     track = changed(track, slice(None), orientation_cov=cov)
-    words = said(choose_worst(track, 7))
+    words = in_words(choose_worst(track, 7))
     assert set(words) == {5, 10, 15, 20, 25, 30, 36}
     assert words[5] == "the orientation jumps"
     assert words[10] == "cameras 5.7° apart, usually 0°"
@@ -59,16 +59,16 @@ def test_many_gaps_do_not_hide_a_spike():
     for first in range(8, 40, 4):
         track = lost(track, slice(first, first + 1))
     track = changed(track, 3, flags=Flag.SPIKE)
-    assert 3 in said(choose_worst(track, 2))
+    assert 3 in in_words(choose_worst(track, 2))
 
 
-def test_of_a_run_of_one_flag_the_lowest_score_is_shown():
+def test_the_lowest_score_of_a_run_of_one_flag_is_shown():
     track = changed(true_track(), slice(12, 19), flags=Flag.DOUBTFUL_FIT)
     track = camera_changed(track, "cam1", 16, score=0.9)
     assert list(choose_worst(track, 1)) == [16]
 
 
-def test_what_is_not_in_doubt_is_not_called_bad():
+def test_undoubted_frames_are_not_called_bad():
     bad = choose_worst(true_track(), 5)
     assert len(bad) == 5
     assert next(iter(bad)) == 0  # the lowest score, as planted
@@ -76,7 +76,7 @@ def test_what_is_not_in_doubt_is_not_called_bad():
 
 
 @pytest.mark.parametrize("count", [1, 6, 500])
-def test_frames_are_apart_and_not_more_than_asked(count):
+def test_frames_are_apart_and_not_more_than_the_option_allows(count):
     track = changed(true_track(), slice(0, 40), flags=np.arange(40) % 5 == 0)
     rows = sorted(choose_worst(track, count))
     assert 1 <= len(rows) <= count

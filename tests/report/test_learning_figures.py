@@ -1,4 +1,4 @@
-"""Figures of a proposer's training: what is right is marked so, curves are those of the rows."""
+"""Figures of a proposer's training: right proposals are marked, curves are those of the rows."""
 
 import pytest
 import torch

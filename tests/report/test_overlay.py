@@ -1,4 +1,4 @@
-"""The overlay shows what the track says, where the movie shows it."""
+"""The overlay draws the track at the right pixels of the movie."""
 
 from contextlib import ExitStack
 from dataclasses import replace
@@ -194,7 +194,7 @@ def test_every_flag_and_reason_has_words():
     assert len(set(words)) == len(words)
 
 
-def test_doubts_are_told_in_words():
+def test_doubts_are_shown_in_words():
     track = true_track()
     assert frame_warnings(track, 3) == []
     bad = changed(track, 3, flags=Flag.SPIKE | Flag.ONE_CAMERA, valid=False)
@@ -222,7 +222,7 @@ def test_frames_of_doubt_are_marked(ready):
     assert "not valid" in lost.balls[0].state(K)[0]
 
 
-def test_a_camera_that_by_itself_sees_the_ball_elsewhere_is_shown(ready):
+def test_a_camera_that_alone_measures_another_pose_is_shown(ready):
     page, pictures = ready
     whole = page.balls[0].track
     centre = whole.cameras["cam1"].centre_px[K]
@@ -323,7 +323,7 @@ def test_tracks_of_other_times_are_refused(tmp_path):
 
 
 def test_without_a_map_outline_and_axes_are_shown(tmp_path):
-    """A ball whose paint is not known yet is drawn on all the same."""
+    """Outline and axes of a ball without a map are drawn all the same."""
     with ExitStack() as opened:
         page, streams = prepared(true_track(("cam1",)), excerpt().with_sphere(texture_path=None), None, opened)
         _, pictures = next(pictures_by_row(streams, np.array([K])))
@@ -348,7 +348,7 @@ def test_the_command_writes_movie_and_sheet(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         ([], "expected something to write, got neither --out nor --worst"),
         (["--out", "o.mp4", "--frames", "9:3"], "--frames 9:3: expected A:B, A below B"),
@@ -356,11 +356,11 @@ def test_the_command_writes_movie_and_sheet(tmp_path, monkeypatch, capsys):
         (["--out", "o.avi"], "expected .mp4 .m4v .mov .mkv, got '.avi'"),
     ],
 )
-def test_the_command_refuses_in_one_line(tmp_path, monkeypatch, capsys, words, told):
+def test_the_command_refuses_in_one_line(tmp_path, monkeypatch, capsys, words, message):
     monkeypatch.chdir(tmp_path)
     true_track().save(tmp_path / "track.h5")
-    code, _, said = command(monkeypatch, capsys, "overlay", EXCERPT / "experiment.yaml", "track.h5", *words)
+    code, _, errors = command(monkeypatch, capsys, "overlay", EXCERPT / "experiment.yaml", "track.h5", *words)
     assert code == 2
-    assert told in said
-    assert said.count("\n") == 1
+    assert message in errors
+    assert errors.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["track.h5"]

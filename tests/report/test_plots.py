@@ -1,4 +1,4 @@
-"""The figures of section IV: what was planted is what is drawn, in the units that the labels name."""
+"""The figures of section IV: planted values are drawn, in the units of the labels."""
 
 import re
 from collections.abc import Callable
@@ -47,7 +47,7 @@ def interval(value: object, below: float = 0.1, above: float = 0.2) -> Interval:
 
 
 def planted_track(frames: int = 60, cameras: tuple[str, ...] = ("a", "b")) -> Trajectory:
-    """A sphere that moves along x, falls along z and turns about z by 20 degrees a frame."""
+    """A sphere that moves along x, falls along z and rotates about z by 20 degrees a frame."""
     time = np.arange(frames) / RATE_HZ
     position = np.stack([100 * time, np.zeros(frames), -50 * time**2], axis=1)
     R = Rotation.from_euler("z", 20.0 * np.arange(frames)[:, None], degrees=True).as_matrix()
@@ -237,7 +237,7 @@ def note_of(figure: Figure) -> str:
 
 
 @every_figure
-def test_every_axis_says_its_unit(name):
+def test_every_axis_names_its_unit(name):
     figure = FIGURES[name]()
     assert figure.axes
     for axes in figure.axes:
@@ -277,7 +277,7 @@ def test_legends_cover_no_data_and_leave_the_page_nowhere(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["densities", *(slow(name) for name in FIGURES if name != "densities")])
-def test_the_same_input_gives_the_same_bytes_whatever_the_users_own_style(name, tmp_path):
+def test_the_same_input_gives_the_same_bytes_with_any_style_of_the_user(name, tmp_path):
     first = plots.write_figure(FIGURES[name](), tmp_path / "first.one")
     with matplotlib.rc_context({"font.size": 20, "lines.linewidth": 7, "axes.facecolor": "yellow", "pdf.fonttype": 3}):
         again = plots.write_figure(FIGURES[name](), tmp_path / "again")
@@ -302,7 +302,7 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
 
 @every_figure
 def test_a_component_has_its_colour_in_every_figure(name):
-    """Orange, green, blue and black, also to those who see neither red nor green."""
+    """Orange, green, blue and black, also for colour-blind readers."""
     colours = {"x": "#d55e00", "y": "#009e73", "z": "#0072b2", "all": "#000000"}
     figure = FIGURES[name]()
     artists = [line for axes in figure.axes for line in axes.lines]
@@ -355,7 +355,7 @@ def test_bands_are_two_standard_deviations_wide():
     assert widths[1] == pytest.approx(2 * 2 * 2.0)  # y rests: 4 standard deviations of 2 mm
 
 
-def test_what_was_measured_is_dots():
+def test_measurements_are_dots():
     track = planted_track()
     axes = plots.track_figure(track).axes[0]
     dots = [line for line in axes.lines if line.get_marker() == "."]
@@ -382,7 +382,7 @@ def test_the_scale_of_angles_is_that_of_the_motion_and_the_whole_circle_where_th
 
 
 def test_bands_of_angles_agree_with_drawn_orientations():
-    """Oracle: errors of the orientation in lab components, drawn and turned into angles one by one."""
+    """Oracle: errors of the orientation in lab components, drawn and converted to angles one by one."""
     theta_deg, cov = np.array([40.0, 50.0, -70.0]), np.deg2rad(0.2) ** 2 * np.diag([1.0, 9.0, 4.0])
     cov[0, 2] = cov[2, 0] = np.deg2rad(0.2) ** 2 * 1.5
     R = Rotation.from_euler("XYZ", theta_deg, degrees=True)  # Rx Ry Rz
@@ -433,7 +433,7 @@ def test_frames_that_are_not_valid_are_shaded():
     assert not [c for c in plots.track_figure(planted_track()).axes[0].collections if c.get_label() == "not valid"]
 
 
-def test_of_a_long_track_the_best_part_of_the_longest_segment_is_shown_and_named():
+def test_the_best_part_of_the_longest_segment_of_a_long_track_is_shown_and_named():
     """Segments of 1000, 5000 and 3000 frames; of the longest, all but frames 3500 to 5499 are half lost."""
     track = planted_track(9000, cameras=())
     segment = np.repeat([0, 1, 2], [1000, 5000, 3000])
@@ -511,7 +511,7 @@ def test_distances_are_in_degrees_and_their_density_is_one_in_all(outlier_deg):
         assert np.nanmax(values * np.diff(edges)) < 0.3
 
 
-def test_every_pair_of_cameras_has_a_panel_which_without_a_comparison_says_nothing_of_perspective():
+def test_every_pair_of_cameras_has_a_panel_without_a_note_on_perspective_where_nothing_is_compared():
     distance = planted_distance(rough=False)
     figure = plots.camera_distance_figure([distance, replace(distance, cameras=("left", "top"))])
     assert legend_texts(figure)[0].startswith("distance: median 1.2° of 4,000 frames")
@@ -645,7 +645,7 @@ def test_angles_have_densities_by_degree_beside_the_uniform_law():
         (np.nan, "uniformity of the orientations could not be tested"),
     ],
 )
-def test_the_test_of_uniformity_is_told_in_words(p_value, words):
+def test_the_test_of_uniformity_is_reported_in_words(p_value, words):
     note = note_of(plots.angles_figure(planted_angles(), uniformity(p_value)))
     assert note.startswith(words)
     assert np.isnan(p_value) or "12,345 frames in 77 segments, worth 210 independent" in note
@@ -719,7 +719,7 @@ def test_shares_of_noise_are_bars_in_percent_with_intervals_and_the_limit():
     assert len({bar.patches[0].get_hatch() for bar in axes.containers}) == 3
 
 
-def test_what_a_smoother_lost_is_not_called_noise_and_without_any_the_axis_is_linear():
+def test_the_loss_of_a_smoother_is_not_called_noise_and_without_any_the_axis_is_linear():
     [axes] = plots.noise_figure(TABLE, "removed").axes
     assert axes.get_ylabel() == "variance smoothed away (%)"
     [axes] = plots.noise_figure({"velocity": planted_moments("velocity", (0.0, 0.0, 0.0))}).axes
@@ -737,7 +737,7 @@ def test_what_a_smoother_lost_is_not_called_noise_and_without_any_the_axis_is_li
         (np.nan, 1.0, 2.0, "unknown"),
     ],
 )
-def test_an_interval_is_told_with_the_digits_it_deserves(value, low, high, words):
+def test_an_interval_is_printed_with_its_significant_digits(value, low, high, words):
     of = Interval(value=np.array(value), low=np.array(low), high=np.array(high), error=np.array(0.1))
     assert interval_text(of) == words
     if np.isfinite(low):
@@ -766,7 +766,7 @@ def test_tracks_without_anything_measured_are_drawn(frames, cameras, tmp_path):
     for figure in figures:
         figure.canvas.draw()
         words = [text.get_text() for axes in figure.axes for text in axes.texts]
-        assert len(words) == len(figure.axes)  # every panel says that there is nothing
+        assert len(words) == len(figure.axes)  # every panel notes that it is empty
     if frames > 2000:
         assert "none of them in a segment" in note_of(figures[0])
     assert not any(np.isfinite(line.get_ydata()).any() for line in figures[0].axes[1].lines), "angles of NaN are not 0"

@@ -61,33 +61,33 @@ BAD = {
 
 @pytest.mark.parametrize(("names", "words"), BAD.items(), ids=list(BAD))
 def test_bad_input_is_one_line_and_leaves_nothing(place, report, tmp_path, names, words):
-    code, _, said = report(*(place / name for name in names.split()), "--out", tmp_path / "page", "--quiet")
+    code, _, errors = report(*(place / name for name in names.split()), "--out", tmp_path / "page", "--quiet")
     assert code == 2
-    assert len(said.strip().splitlines()) == 1
-    assert words in said
+    assert len(errors.strip().splitlines()) == 1
+    assert words in errors
     assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_with_other_things_in_it_is_left_alone(place, report, tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
-    code, _, said = report(place / "precise.h5", "--out", tmp_path, "--quiet", *QUICK)
+    code, _, errors = report(place / "precise.h5", "--out", tmp_path, "--quiet", *QUICK)
     assert code == 2
-    assert "an older report only" in said
+    assert "an older report only" in errors
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_a_file_in_place_of_a_folder_is_said_before_any_work(place, report, tmp_path):
-    code, _, said = report(place / "precise.h5", "--out", place / "precise.h5" / "page")
+def test_a_file_in_place_of_a_folder_is_refused_before_any_work(place, report, tmp_path):
+    code, _, errors = report(place / "precise.h5", "--out", place / "precise.h5" / "page")
     assert code == 2
-    assert "a folder to write in" in said
+    assert "a folder to write in" in errors
 
 
 @pytest.mark.slow
-def test_one_segment_has_a_page_and_a_line_that_says_what_is_missing(place, report, tmp_path):
-    code, out, said = report(place / "one.h5", "--out", tmp_path / "page", "--quiet")
+def test_one_segment_has_a_page_and_a_line_on_what_is_missing(place, report, tmp_path):
+    code, out, errors = report(place / "one.h5", "--out", tmp_path / "page", "--quiet")
     assert code == 0
     assert out == ""
-    (line,) = [line for line in said.splitlines() if line.startswith("Segments")]
+    (line,) = [line for line in errors.splitlines() if line.startswith("Segments")]
     assert "no intervals" in line
     page = (tmp_path / "page" / "index.html").read_text()
     assert "figure-track" in page
@@ -108,9 +108,9 @@ def test_paint_that_was_not_used_is_drawn(place, report, tmp_path):
 @pytest.mark.slow
 def test_many_tracks_make_one_page_that_needs_nothing_beside_it(place, report, tmp_path):
     out = tmp_path / "page"
-    code, told, _ = report(place / "a/track.h5", place / "b/track.h5", "--out", out, *QUICK)
+    code, printed, _ = report(place / "a/track.h5", place / "b/track.h5", "--out", out, *QUICK)
     assert code == 0
-    assert told.rstrip().endswith(f"Wrote {out / 'index.html'}")
+    assert printed.rstrip().endswith(f"Wrote {out / 'index.html'}")
     page = (out / "index.html").read_text()
     assert "a/track.h5" in page
     assert "b/track.h5" in page
@@ -154,7 +154,7 @@ def test_same_tracks_same_numbers_and_same_pictures(place, report, tmp_path):
         assert report(place / "a/track.h5", "--out", tmp_path / name, *QUICK, "--quiet")[0] == 0
     files = sorted(path.relative_to(tmp_path / "first") for path in (tmp_path / "first").rglob("*.*"))
     for path in files:
-        if path.name != "index.html":  # which says when it was made
+        if path.name != "index.html":  # which holds its date
             assert (tmp_path / "first" / path).read_bytes() == (tmp_path / "second" / path).read_bytes(), path
 
 
@@ -172,9 +172,9 @@ def test_settings_of_the_statistics_are_obeyed_and_shown(place, report, tmp_path
 def test_an_experiment_of_another_name_is_refused(place, report, tmp_path):
     excerpt = Path(__file__).parents[2] / "synthetic_data" / "excerpt" / "experiment.yaml"
     tracks = [place / "a/track.h5", place / "b/track.h5"]
-    code, _, said = report(*tracks, "--experiment", excerpt, "--out", tmp_path / "page", "-q")
+    code, _, errors = report(*tracks, "--experiment", excerpt, "--out", tmp_path / "page", "-q")
     assert code == 2
-    assert "the experiment.yaml that the track was measured from" in said
+    assert "the experiment.yaml that the track was measured from" in errors
 
 
 @pytest.mark.slow
@@ -185,9 +185,9 @@ def test_half_a_report_never_stands_under_its_name(place, report, tmp_path, monk
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(build, "write_figure", full)
-    code, _, said = report(place / "a/track.h5", "--out", tmp_path / "page", *QUICK, "--quiet")
+    code, _, errors = report(place / "a/track.h5", "--out", tmp_path / "page", *QUICK, "--quiet")
     assert code == 2
-    assert "No space left on device" in said
+    assert "No space left on device" in errors
     assert not list(tmp_path.iterdir())
 
 

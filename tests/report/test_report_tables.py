@@ -89,7 +89,7 @@ def test_angles_and_distances_are_in_the_units_of_their_names(written):
     assert (float(angles[0]["from_deg"]), float(angles[-1]["to_deg"])) == pytest.approx((-90, 90))
 
 
-def test_what_was_lost_and_what_the_flow_is(written):
+def test_lost_frames_and_the_flow_are_listed(written):
     (row,) = rows_of(written[0], "tracks")
     assert (row["file"], row["lost"]) == ("a/track.h5", "left: 7; right: 7")
     assert 0 < float(row["stated_error_deg"]) < 5
@@ -98,7 +98,7 @@ def test_what_was_lost_and_what_the_flow_is(written):
     assert flow["(nu^3 / epsilon)^(1/4)"] == pytest.approx(1e-6**0.75)
 
 
-def test_of_one_segment_only_what_needs_no_interval(tracked):
+def test_a_single_segment_gives_only_numbers_without_an_interval(tracked):
     first = tracked.at(np.flatnonzero(tracked.segment == tracked.segment[np.argmax(np.bincount(tracked.segment))]))
     one = first.at(np.flatnonzero(first.segment == np.bincount(first.segment).argmax()))
     found = tables_of(summarise(one, StatisticsSettings(min_frames=10)), {"one": one}, [])

@@ -1,4 +1,4 @@
-"""Several balls in overlay, report, export and recording: each where it is, nearer before farther, under its name."""
+"""Several balls in overlay, report, export and recording: each at its position, nearer first, under its name."""
 
 from contextlib import ExitStack
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Planted trouble comes out in the strip and the stretches, and the pictures show the ball."""
+"""Planted faults appear in the strip and the stretches, and the pictures show the ball."""
 
 import html
 import io
@@ -84,7 +84,7 @@ def test_frames_without_a_ball_are_neither_doubtful_nor_lost():
     assert track.summary()["lost"] == {"cam1": {"not_found": 3}, "cam2": {}}
 
 
-def test_the_strip_says_of_every_frame_what_was_planted():
+def test_the_strip_shows_of_every_frame_what_was_planted():
     track = camera_changed(troubled(), "cam1", 5, score=0.6)
     track = camera_changed(track, "cam1", 7, orientation=TURN)
     strip = strip_of(track)
@@ -94,15 +94,15 @@ def test_the_strip_says_of_every_frame_what_was_planted():
     assert strip["status"] == status.tolist()
     assert strip["counts"] == [275, 0, 5, 20]
     assert strip["number"] == strip["row"] == list(range(300))
-    told = strip["reason_words"]
-    words = {camera["name"]: [told[code] for code in camera["reason"]] for camera in strip["cameras"]}
+    reasons = strip["reason_words"]
+    words = {camera["name"]: [reasons[code] for code in camera["reason"]] for camera in strip["cameras"]}
     assert words["cam1"] == ["measured"] * 60 + ["too dark"] * 20 + ["measured"] * 220
     assert set(words["cam2"][60:70]) == {"no clear outline"}
     assert set(words["cam2"][70:80]) == {"measured"}
     assert words["cam2"][121] == "no orientation explains the picture"
-    told = dict(strip["flag_words"])
+    flags = dict(strip["flag_words"])
     planted = {"found again after a loss", "the orientation jumps"}
-    assert {told[bit] for bit in told if strip["flags"][200] & bit} == planted
+    assert {flags[bit] for bit in flags if strip["flags"][200] & bit} == planted
     assert [k for k in range(300) if strip["flags"][k]] == [85, 200]
     assert strip["cameras"][0]["score"][5] == 0.6
     assert strip["cameras"][0]["score"][61] is None
@@ -193,7 +193,7 @@ def test_the_page_has_no_number_that_json_lacks_and_a_row_a_stretch():
     assert "cam1: too dark (20); cam2: no clear outline (10); the orientation jumps (1)" in page
 
 
-def test_style_and_script_ask_for_nothing_from_elsewhere():
+def test_style_and_script_load_nothing_from_elsewhere():
     for text in strip_assets():
         assert len(text) > 1000
         assert not re.search(r"https?:|@import|url\(|fetch\(|</", text)
@@ -222,7 +222,7 @@ def test_pictures_are_of_the_bad_frames_and_of_good_ones_between():
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 500])
-def test_there_are_not_more_pictures_than_asked_and_the_first_is_of_the_worst(count):
+def test_there_are_not_more_pictures_than_given_by_the_option_and_the_first_is_of_the_worst(count):
     why = chosen_frames(lost_excerpt(), count)
     assert len(why) == min(count, 40)
     assert not count or 20 <= next(iter(why)) < 28
@@ -250,13 +250,13 @@ def test_the_page_begins_with_the_worst_frame_and_its_reason():
 
 @pytest.mark.slow
 def test_the_pictures_show_the_ball_within_its_outline():
-    track, told = lost_excerpt(), []
-    shown = gallery(track, excerpt(), count=6, progress=lambda done, total: told.append((done, total)))
+    track, calls = lost_excerpt(), []
+    shown = gallery(track, excerpt(), count=6, progress=lambda done, total: calls.append((done, total)))
     rows = [frame.k for frame in shown.frames]
     assert 5 in rows
     assert any(20 <= k < 28 for k in rows)
     assert sum(track.valid[k] and k != 5 for k in rows) >= 2
-    assert told == [(done, 6) for done in range(1, 7)]
+    assert calls == [(done, 6) for done in range(1, 7)]
     assert set(status_of(track)[rows]) == {GOOD, DOUBTFUL, NOT_VALID}
     assert shown.numbers.tolist() == list(range(len(track)))
     assert rows == list(chosen_frames(track, 6))

@@ -87,7 +87,7 @@ def test_a_click_on_a_stretch_shows_a_frame_of_it_and_its_picture(open_page, pag
         assert part.locator(".strip__nearest").inner_text() == f"Picture of frame {number}:"
 
 
-def test_arrow_keys_step_by_one_and_say_which_picture_is_nearest(open_page, page_path):
+def test_arrow_keys_step_by_one_and_the_nearest_picture_is_named(open_page, page_path):
     with open_page(page_path) as page:
         part = section(page, "excerpt")
         part.locator("tr").nth(1).click()
@@ -97,13 +97,13 @@ def test_arrow_keys_step_by_one_and_say_which_picture_is_nearest(open_page, page
             before = chosen(part)
             page.keyboard.press("ArrowRight")
             assert chosen(part) == before + 1
-            told = part.locator(".strip__nearest").inner_text()
+            caption = part.locator(".strip__nearest").inner_text()
             nearest = min(abs(one - chosen(part)) for one in pictured)
             if nearest:
-                assert told.startswith(f"No picture of frame {chosen(part)} embedded; nearest is frame ")
-                assert abs(int(told.rstrip(".").split()[-1]) - chosen(part)) == nearest
+                assert caption.startswith(f"No picture of frame {chosen(part)} embedded; nearest is frame ")
+                assert abs(int(caption.rstrip(".").split()[-1]) - chosen(part)) == nearest
             else:
-                assert told == f"Picture of frame {chosen(part)}:"
+                assert caption == f"Picture of frame {chosen(part)}:"
         page.keyboard.press("ArrowLeft")
         assert chosen(part) == before
         page.keyboard.press("Home")
@@ -132,7 +132,7 @@ def test_the_bad_stretch_has_its_colour_and_the_good_frames_have_not(open_page, 
             assert pixel(excerpts, ".strip__detail", 12.3 / 40, 14) == (0xA6, 0xCB, 0xE3)
 
 
-def test_a_click_on_the_overview_goes_there_and_the_pointer_is_told_what_it_is_over(open_page, page_path):
+def test_a_click_on_the_overview_goes_there_and_the_pointer_gets_a_tooltip(open_page, page_path):
     with open_page(page_path) as page:
         part = section(page, "planted")
         canvas = part.locator(".strip__overview")

@@ -1,4 +1,4 @@
-"""Lengths carry the track's unit in every output; nothing is said of the translation of a ball at a fixed place."""
+"""Lengths carry the track's unit in every output; a fixed ball has no translation."""
 
 import io
 import re
@@ -38,7 +38,7 @@ def lengths_in(text):
     return [word for word in ("mm", "m/s", "_m_s", "m per s") if word in text]
 
 
-def test_the_file_and_its_tables_say_radii_where_lengths_are(track, tmp_path):
+def test_the_file_and_its_tables_have_lengths_in_radii(track, tmp_path):
     """Before: mm and m/s in file, table and export. After: radii, radii/s; other units as ever."""
     track.save(tmp_path / "track.h5")
     with h5py.File(tmp_path / "track.h5") as file:
@@ -66,7 +66,7 @@ def test_a_file_without_the_unit_is_in_mm(track, tmp_path):
     assert Trajectory.load(tmp_path / "track.h5").length_unit == "mm"
 
 
-def test_figures_say_radii(track):
+def test_figures_have_lengths_in_radii(track):
     labels = [axes.get_ylabel() for axes in (*plots.track_figure(track).axes, *track.plot().axes)]
     (path,) = plots.path_figure(track).axes
     labels += [path.get_xlabel(), path.get_zlabel()]
@@ -74,7 +74,7 @@ def test_figures_say_radii(track):
     assert not lengths_in(" ".join(labels))
 
 
-def test_statistics_and_their_figures_say_radii():
+def test_statistics_and_their_figures_have_lengths_in_radii():
     tracks = replace(draw_ensemble(EnsembleSpec(segments=4, mean_frames=90.0), 1), length_unit="radii")
     table = summarise(tracks, FEW).table
     assert [table[name].units for name in ("velocity", "acceleration", "omega_lab")] == [
@@ -105,7 +105,7 @@ def test_tracks_of_different_units_are_not_averaged():
 
 
 def held(track, spread_mm=1e-9):
-    """The track of a ball at a fixed place: positions held there, with the place's own error."""
+    """The track of a fixed ball: one position, with its error."""
     rng = np.random.default_rng(1)
     place = np.array([1.0, 2.0, 3.0]) + spread_mm * rng.normal(size=(len(track), 3))
     still = {name: 1e-10 * rng.normal(size=(len(track), 3)) for name in ("velocity", "acceleration")}
@@ -115,7 +115,7 @@ def held(track, spread_mm=1e-9):
 
 
 @pytest.mark.slow
-def test_the_report_of_a_fixed_ball_says_nothing_of_its_translation(tmp_path):
+def test_the_report_of_a_fixed_ball_has_nothing_on_its_translation(tmp_path):
     """Before: six verdicts "velocity x: 100 % of the variance is smoothed away", 1.25e-10 m/s in large letters.
 
     After: one sentence that the centre is fixed; omega and alpha as of any track, to the digit.
@@ -129,10 +129,10 @@ def test_the_report_of_a_fixed_ball_says_nothing_of_its_translation(tmp_path):
     assert [one.words for one in found if one.title == "Place"] == [
         "the centre is fixed: this page reports the rotation only"
     ]
-    said = " ".join(f"{one.title} {one.words}" for one in found)
-    assert "velocity" not in said
-    assert "acceleration" not in said
-    assert "Lift" not in said
+    words = " ".join(f"{one.title} {one.words}" for one in found)
+    assert "velocity" not in words
+    assert "acceleration" not in words
+    assert "Lift" not in words
     write_report({"track.h5": still}, tmp_path / "report", settings=FEW)
     page = re.sub("base64,[A-Za-z0-9+/=]+", "", (tmp_path / "report" / "index.html").read_text())
     assert "<title>Rotation of a sphere" in page

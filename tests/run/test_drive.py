@@ -25,8 +25,8 @@ def settings() -> Settings:
 def alone(tmp_path_factory) -> dict[str, tuple[str, tuple[int, ...], bytes]]:
     """The excerpt tracked by one process."""
     out = tmp_path_factory.mktemp("alone") / "track.h5"
-    told = run(EXCERPT, "--out", out, "-q", *SHORT_BLOCKS)
-    assert told.returncode == 0, told.stderr
+    ended = run(EXCERPT, "--out", out, "-q", *SHORT_BLOCKS)
+    assert ended.returncode == 0, ended.stderr
     return datasets(out)
 
 
@@ -54,8 +54,8 @@ def test_one_track_for_two_experiments_is_refused(tmp_path, settings):
 @pytest.mark.slow
 def test_two_workers_give_the_bytes_of_one(tmp_path, alone):
     out = tmp_path / "track.h5"
-    told = run(EXCERPT, "--out", out, "--jobs", 2, *SHORT_BLOCKS)
-    assert told.returncode == 0, told.stderr
+    ended = run(EXCERPT, "--out", out, "--jobs", 2, *SHORT_BLOCKS)
+    assert ended.returncode == 0, ended.stderr
     assert datasets(out) == alone
     assert not out.with_name("track.h5.parts").exists()
 
@@ -66,20 +66,20 @@ def test_an_experiment_that_fails_does_not_stop_the_others(tmp_path, alone):
     shutil.copytree(EXCERPT.parent, good)
     out = tmp_path / "out"
     out.mkdir()
-    told = run(bad, tmp_path / "none" / "experiment.yaml", good / "experiment.yaml", "-o", out, "-j", 2, *SHORT_BLOCKS)
-    assert told.returncode == 1
+    ended = run(bad, tmp_path / "none" / "experiment.yaml", good / "experiment.yaml", "-o", out, "-j", 2, *SHORT_BLOCKS)
+    assert ended.returncode == 1
     assert datasets(out / "good.h5") == alone
-    lines = told.stderr.splitlines()
+    lines = ended.stderr.splitlines()
     assert [line.split(":")[1].strip() for line in lines if line.startswith("sphereorient")] == ["bad", "none"]
-    assert "Traceback" not in told.stderr
-    assert "40" in told.stdout
-    assert "failed" in told.stdout
+    assert "Traceback" not in ended.stderr
+    assert "40" in ended.stdout
+    assert "failed" in ended.stdout
     assert not (out / "bad.h5").exists()
 
 
 @pytest.mark.slow
 def test_a_worker_that_dies_is_replaced_and_its_experiment_goes_on(tmp_path, settings, alone):
-    """Killed when the first window is there: what it had done is not done again."""
+    """Killed after the first window: finished windows are not computed again."""
     request = Request(experiment=EXCERPT, out=tmp_path / "track.h5", settings=settings)
     executor = ProcessExecutor(1)
     killed: list[tuple[int, set[str]]] = []

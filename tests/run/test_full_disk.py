@@ -34,11 +34,11 @@ def track(out: Path, size: int, *more: str) -> subprocess.CompletedProcess[str]:
 def test_a_full_disk_is_one_line_and_the_earlier_track_stays(tmp_path, size):
     out = tmp_path / "track.h5"
     out.write_bytes(b"an earlier track")
-    told = track(out, size)
-    assert told.returncode == 2
-    assert len(told.stderr.strip().splitlines()) == 1, told.stderr
-    assert "Traceback" not in told.stderr
-    assert "space left" in told.stderr or "has room" in told.stderr
+    result = track(out, size)
+    assert result.returncode == 2
+    assert len(result.stderr.strip().splitlines()) == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    assert "space left" in result.stderr or "has room" in result.stderr
     assert out.read_bytes() == b"an earlier track"
     assert not list(tmp_path.glob(".*"))
 
@@ -49,8 +49,8 @@ def test_when_there_is_room_again_the_run_goes_on(tmp_path):
     out = tmp_path / "track.h5"
     learnt = tmp_path / "learnt.h5"
     assert run(EXCERPT, "--out", clean, "-q", *SHORT_BLOCKS, "--save-learnt", learnt).returncode == 0
-    told = track(out, 100_000, "--learnt", str(learnt))
-    assert told.returncode == 2
+    result = track(out, 100_000, "--learnt", str(learnt))
+    assert result.returncode == 2
     assert list((tmp_path / "track.h5.parts").glob("poses-*"))
     again = run(EXCERPT, "--out", out, "-q", *SHORT_BLOCKS, "--learnt", learnt, "--resume")
     assert again.returncode == 0, again.stderr
@@ -58,11 +58,11 @@ def test_when_there_is_room_again_the_run_goes_on(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_place_that_may_not_be_written_is_one_line(tmp_path):
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
     (tmp_path / "none").touch()
-    told = run(EXCERPT, "--out", tmp_path / "none" / "track.h5")
-    assert told.returncode == 2
-    assert "expected a folder to write in" in told.stderr
-    told = run(EXCERPT, "--out", "/proc/track.h5")
-    assert told.returncode == 2
-    assert len(told.stderr.strip().splitlines()) == 1, told.stderr
+    result = run(EXCERPT, "--out", tmp_path / "none" / "track.h5")
+    assert result.returncode == 2
+    assert "expected a folder to write in" in result.stderr
+    result = run(EXCERPT, "--out", "/proc/track.h5")
+    assert result.returncode == 2
+    assert len(result.stderr.strip().splitlines()) == 1, result.stderr

@@ -54,7 +54,7 @@ def test_a_folder_of_the_users_is_refused_and_stays(tmp_path):
     assert {path.name for path in request.parts.iterdir()} == {"thesis.txt", "run.json"}
 
 
-def test_what_is_not_of_the_run_stays_when_its_folder_is_emptied(store, tmp_path):
+def test_files_of_others_stay_when_the_folder_of_a_run_is_emptied(store, tmp_path):
     (store.folder / "notes.txt").write_text("mine")
     with store.held(request_to(tmp_path / "track.h5"), resume=False):
         assert store.missing([BATCH]) == [BATCH]
@@ -116,8 +116,8 @@ def test_parts_of_another_run_are_refused_with_what_differs(store, tmp_path):
         store.held(of_one, resume=True),
     ):
         pass
-    told = json.loads((store.folder / "run.json").read_text())
-    (store.folder / "run.json").write_text(json.dumps(told | {"cam1.mkv": "12 34"}))
+    saved = json.loads((store.folder / "run.json").read_text())
+    (store.folder / "run.json").write_text(json.dumps(saved | {"cam1.mkv": "12 34"}))
     request = request_to(tmp_path / "track.h5")
     with pytest.raises(TrackError, match=r"with another cam1\.mkv;"), store.held(request, resume=True):
         pass

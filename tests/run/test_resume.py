@@ -1,4 +1,4 @@
-"""A run that was killed goes on where it was, and its track is that of a run that was not, to the last bit."""
+"""A killed run resumes, and its track is that of an uninterrupted run, to the last bit."""
 
 import os
 import random
@@ -33,7 +33,7 @@ def request_of(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, request_of) -> Path:
-    """A run that nothing disturbed, what it learnt, and what its parts were like halfway."""
+    """An uninterrupted run, its appearance, and its parts halfway."""
     folder = tmp_path_factory.mktemp("whole")
     request = request_of(folder, save_learnt=folder / "learnt.h5")
 
@@ -52,7 +52,7 @@ def tracked(request: Request, **more: object) -> None:
 
 
 def halfway(whole: Path, request: Request) -> FolderStore:
-    """Put parts where a run that was cut off has left them."""
+    """Put parts as an interrupted run leaves them."""
     shutil.copytree(whole / "half", request.parts)
     return FolderStore(request.parts)
 
@@ -92,7 +92,7 @@ def test_parts_cut_off_while_written_are_measured_again(whole, tmp_path, request
 
 
 @pytest.mark.slow
-def test_a_damaged_part_is_told_and_measured_again_by_the_next_run(whole, tmp_path, request_of):
+def test_a_damaged_part_is_reported_and_measured_again_by_the_next_run(whole, tmp_path, request_of):
     request = request_of(tmp_path)
     parts = halfway(whole, request)
     (part,) = sorted(parts.folder.glob("poses-*"))[:1]
@@ -105,13 +105,13 @@ def test_a_damaged_part_is_told_and_measured_again_by_the_next_run(whole, tmp_pa
 
 
 @pytest.mark.slow
-def test_what_was_learnt_measures_the_same_again(whole, tmp_path, request_of):
+def test_a_kept_appearance_measures_the_same_again(whole, tmp_path, request_of):
     again = request_of(tmp_path, learnt=whole / "learnt.h5")
     tracked(again)
     assert datasets(again.out) == datasets(whole / "track.h5")
 
 
-@pytest.mark.slow  # the run whose knowledge it is
+@pytest.mark.slow  # needs the run that learnt it
 def test_knowledge_of_other_cameras_is_refused(whole, tmp_path, request_of):
     other = tmp_path / "other.h5"
     shutil.copy(whole / "learnt.h5", other)
@@ -125,7 +125,7 @@ def test_knowledge_of_other_cameras_is_refused(whole, tmp_path, request_of):
 
 @pytest.mark.slow
 def test_ten_kills_at_any_moment_leave_the_same_track(tmp_path):
-    """kill -9 from the first import to the last write; each run goes on with what the one before has left."""
+    """kill -9 from the first import to the last write; each run resumes the one before."""
     clean = tmp_path / "clean.h5"
     begin = time.monotonic()
     assert run(EXCERPT, "--out", clean, "-q", *SHORT_BLOCKS).returncode == 0
@@ -148,6 +148,6 @@ def test_ten_kills_at_any_moment_leave_the_same_track(tmp_path):
             out.unlink()
     assert run(*command[len(COMMAND) :]).returncode == 0
     assert datasets(out) == expected
-    # A kill while the track is written leaves a file of a name that nobody can guess.
+    # A kill while the track is written leaves a file of a random name.
     left = {path.name for path in tmp_path.iterdir() if not path.match(".track.*.partial.h5")}
     assert left == {"clean.h5", "track.h5"}

@@ -1,4 +1,4 @@
-"""Disks for the tests of the grey search: as a camera would give them, with the errors of a real outline."""
+"""Disks for the tests of the grey search: as of a camera, with the errors of a real outline."""
 
 import math
 from functools import cache

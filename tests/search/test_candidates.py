@@ -23,7 +23,7 @@ def candidates(counts: list[int], rng: torch.Generator) -> Candidates:
 
 
 def proposals(counts: list[int], first: int, reason: tuple[Reason, ...]) -> Candidates:
-    """Scores count up from `first`, so that a row is known again."""
+    """Scores count up from `first`, so that each row is unique."""
     total = sum(counts)
     return Candidates(
         offset=torch.tensor([0, *counts]).cumsum(0),

@@ -152,20 +152,20 @@ def test_under_light_from_one_side_it_finds_the_paint_where_one_threshold_does_n
     assert wrong < wrong_globally / 3
 
 
-def test_what_it_leaves_undecided_is_where_one_threshold_alone_is_wrong():
+def test_undecided_pixels_are_those_where_one_threshold_alone_is_wrong():
     disks = clean_disks("blobs", attitudes(20), SIZE)
     truth, inside = torch.where(disks > 95, 1.0, -1.0), VIEW.inside.expand_as(disks)
     lit = disks * (1 + 0.8 * disk_offsets(SIZE)[..., 0].float())
     paint = extract_paint(lit, VIEW.inside, OrientSettings())
     undecided = inside & (paint == 0)
     assert 0.01 < undecided.sum() / inside.sum() < 0.1
-    alone = extract_paint(lit, VIEW.inside, OrientSettings(region_contrast_min=1.0))  # no region speaks
+    alone = extract_paint(lit, VIEW.inside, OrientSettings(region_contrast_min=1.0))  # no region votes
     assert (alone[inside] != 0).all()
     assert torch.equal(alone[inside & ~undecided], paint[inside & ~undecided])
     assert (alone != truth)[undecided].double().mean() > 5 * (alone != truth)[inside & ~undecided].double().mean()
 
 
-def test_a_disk_is_extracted_alike_whatever_comes_with_it():
+def test_a_disk_is_extracted_alike_with_any_other_disks():
     disks = clean_disks("dots", attitudes(4), SIZE)
     together = extract_paint(disks, VIEW.inside, OrientSettings())
     for disk, expected in zip(disks, together, strict=True):

@@ -1,4 +1,4 @@
-"""Two proposers: who is asked when, and in which order their answers come."""
+"""Two proposers: which one is used, and the order of their proposals."""
 
 import math
 
@@ -17,7 +17,7 @@ def turned(*degrees: float) -> Tensor:
 
 
 def proposals(*disks: list[tuple[float, float]]) -> Candidates:
-    """Of each disk some pairs of angle (degrees) and score."""
+    """Proposals of each disk: pairs of angle (degrees) and score."""
     counts = torch.tensor([len(disk) for disk in disks])
     rows = [row for disk in disks for row in disk]
     return Candidates(
@@ -29,7 +29,7 @@ def proposals(*disks: list[tuple[float, float]]) -> Candidates:
 
 
 class Planted:
-    """Answers as planted, by the grey level of a disk's first pixel, and keeps what it was asked."""
+    """Planted proposals by the grey level of a disk's first pixel; keeps these levels."""
 
     def __init__(self, answers: dict[int, list[tuple[float, float]]], size_px: int = 4) -> None:
         self.answers, self.size_px, self.asked = answers, size_px, []
@@ -54,7 +54,7 @@ FIRST = {1: [(0.0, 0.9), (50.0, 0.5)], 2: [(10.0, 0.6), (90.0, 0.5)], 3: []}
 SECOND = {2: [(-60.0, 0.7), (85.0, 0.2)], 3: [(120.0, 0.4)], 1: [(170.0, 1.0)]}
 
 
-def test_the_second_is_asked_about_doubtful_disks_alone() -> None:
+def test_the_second_gets_doubtful_disks_alone() -> None:
     first, second = Planted(FIRST), Planted(SECOND)
     found = FallbackProposer(first, second, sure=0.75).propose(disks(1, 2, 3, 1))
     assert first.asked == [1, 2, 3, 1]
@@ -63,7 +63,7 @@ def test_the_second_is_asked_about_doubtful_disks_alone() -> None:
     assert found.reason == (Reason.OK,) * 4
 
 
-def test_in_doubt_the_second_comes_first_and_nothing_comes_twice() -> None:
+def test_for_a_doubtful_disk_the_second_comes_first_and_nothing_comes_twice() -> None:
     found = FallbackProposer(Planted(FIRST), Planted(SECOND), sure=0.75).propose(disks(2))
     # 90 is within 12 degrees of the second's 85, which comes later in turn than the first's 10 but before its 90.
     assert angles(found, 0) == [-60.0, 10.0, 85.0]
@@ -71,13 +71,13 @@ def test_in_doubt_the_second_comes_first_and_nothing_comes_twice() -> None:
 
 
 @pytest.mark.parametrize(("sure", "asked"), [(0.0, []), (0.61, [2, 3]), (1.0, [1, 2, 3])])
-def test_how_sure_the_first_must_be(sure: float, asked: list[int]) -> None:
+def test_the_threshold_of_the_first_counts(sure: float, asked: list[int]) -> None:
     second = Planted(SECOND)
     FallbackProposer(Planted(FIRST), second, sure=sure).propose(disks(1, 2, 3))
     assert second.asked == asked
 
 
-def test_a_disk_that_neither_knows_has_the_reason_of_the_second() -> None:
+def test_a_disk_without_a_proposal_of_either_has_the_reason_of_the_second() -> None:
     found = FallbackProposer(Planted({}), Planted({}), sure=0.75).propose(disks(1, 2))
     assert found.offset.tolist() == [0, 0, 0]
     assert found.reason == (Reason.LOW_SCORE,) * 2

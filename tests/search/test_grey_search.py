@@ -40,7 +40,7 @@ def test_the_best_proposal_is_the_planted_attitude(kind):
     # Half a pixel of 80 is 0.7 degrees at the disk's middle, the radius' error more away from it.
     assert error.max() < 2.0
     assert error.square().mean().sqrt() < 1.1
-    # The other reading of the matrix is no answer.
+    # The transpose is no answer.
     assert apart_deg(best(found).mT, R_view_body).median() > 20
 
 
@@ -69,7 +69,7 @@ def test_one_pixel_of_80_off_is_found():
 
 
 @pytest.mark.slow
-def test_a_near_camera_sees_less_of_the_ball_and_says_so_by_its_distance():
+def test_a_near_camera_sees_less_of_the_ball_and_its_distance_is_given():
     R_view_body = attitudes(10)
     texture = reduced_texture(texture_of("blobs"), SIZE)
     disks = 20 + 150 * perspective_view(SIZE, 4.0).render(texture, R_view_body.float())
@@ -79,7 +79,7 @@ def test_a_near_camera_sees_less_of_the_ball_and_says_so_by_its_distance():
     assert (near.score[near.offset[:-1]] > far.score[far.offset[:-1]] + 0.02).all()
 
 
-# --- what does not change an answer
+# --- invariance
 
 
 def test_neither_brightness_nor_contrast_nor_the_cameras_units_change_anything():
@@ -113,7 +113,7 @@ def test_a_dim_picture_in_whole_grey_levels_is_found():
     assert best_errors_deg(grey_search_of("patches").propose(dim), R_view_body).max() < 2.0
 
 
-# --- what is no answer
+# --- disks without a proposal
 
 
 def test_a_picture_without_any_contrast_has_a_reason_and_no_proposal():
@@ -185,7 +185,7 @@ def test_proposals_are_rotations_of_float64_best_first_and_distinct():
 @pytest.mark.slow
 def test_a_disks_answer_is_the_same_to_the_last_bit_alone_or_among_37():
     search, disks = grey_search_of("patches"), camera_disks("patches", attitudes(37))
-    disks[5] = 70.0  # one that shows nothing shifts no other's rows
+    disks[5] = 70.0  # an empty disk shifts no other's rows
     assert len(disks) > BATCH
     together, reversed_order = search.propose(disks), search.propose(disks.flip(0))
     three = search.propose(disks[[34, 2, 17]])
@@ -216,7 +216,7 @@ def test_every_rotation_lies_within_the_grids_covering_angle_of_a_template():
     covered_deg = ((trace - 1) / 2).clamp(-1, 1).acos().rad2deg()
     step_deg = GreySearchSettings().step_deg
     assert covered_deg.max() <= (0.5 + 0.5**0.5) * step_deg
-    assert covered_deg.max() > 0.7 * step_deg  # and is no finer than it says
+    assert covered_deg.max() > 0.7 * step_deg  # and is no finer than stated
     # The grid itself, in another order; what fills the last group up is there twice.
     grid = so3.lattman_grid(math.radians(step_deg)).float()
     assert len(templates) - len(grid) < 8
@@ -224,7 +224,7 @@ def test_every_rotation_lies_within_the_grids_covering_angle_of_a_template():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_of_each_attitude_a_peak_of_the_bank_lies_within_the_covering_angle(kind):
+def test_a_peak_of_the_bank_lies_within_the_covering_angle_of_each_attitude(kind):
     search, R_view_body = grey_search_of(kind), attitudes(60, seed=2)
     place, peak = search.search(camera_disks(kind, R_view_body))
     distance = apart_deg(search.templates[place].double(), R_view_body[:, None])

@@ -9,7 +9,7 @@ from sphereorient.search.grey_search import best_of_groups, compact_groups
 
 
 def turned_deg(*angles: float) -> torch.Tensor:
-    """Turns about one axis."""
+    """Rotations about one axis."""
     return so3.exp(torch.deg2rad(torch.tensor(angles))[:, None] * torch.tensor([0.6, 0.0, 0.8]))
 
 
@@ -42,7 +42,7 @@ def test_the_best_of_groups_agree_with_sorting_all(count):
 
 def test_a_rotation_near_a_better_one_is_no_top():
     assert distinct(turned_deg(0, 15, 30, -21, 90), math.radians(20)).tolist() == [True, False, False, True, True]
-    # 30 is near 15 only, which is no top itself: still on the slope of the first one.
+    # 30 is near 15 only, which is no peak itself: it lies on the slope of the first one.
     assert distinct(turned_deg(0, 30), math.radians(20)).tolist() == [True, True]
     assert distinct(turned_deg(0, 359), math.radians(20)).tolist() == [True, False]
 

@@ -30,7 +30,7 @@ def pixel_paint(kind: str) -> TextureTable:
 def disk_of(kind: str, R_view_body: torch.Tensor) -> torch.Tensor:
     """One disk without light or noise, as sharp as its pixels."""
     value, _ = pixel_paint(kind).sample((R_view_body.float().mT @ VIEW.normal_view.T)[None])
-    return VIEW.picture(20 + 150 * value[0], outside=200.0)  # what is beside the ball must not count
+    return VIEW.picture(20 + 150 * value[0], outside=200.0)  # pixels beside the ball must not count
 
 
 def away(R: torch.Tensor, angle_deg: float, count: int, seed: int = 0) -> torch.Tensor:
@@ -93,7 +93,7 @@ def test_a_climb_stays_where_it_is_right_and_takes_no_leaps_where_nothing_fits()
     assert so3.geodesic_distance(moved, far).rad2deg().max() < 8.1  # STEP_RAD
 
 
-def test_the_light_is_solved_whatever_it_is_and_the_negative_explains_nothing():
+def test_any_light_is_solved_and_the_negative_explains_nothing():
     R = attitudes(1, seed=9)[0]
     level = level_of("blobs", 0.05)
     disk = disk_of("blobs", R)
@@ -150,7 +150,7 @@ def test_light_hardly_changes_an_evened_picture_and_another_attitude_does(kind):
     assert others.max() < 0.8
 
 
-def test_what_is_beside_the_ball_does_not_count():
+def test_pixels_beside_the_ball_do_not_count():
     picture = disk_of("patches", attitudes(1)[0])[None]
     outside = disk_offsets(SIZE).norm(dim=-1) >= 1
     assert_close(normalised(torch.where(outside, 1e4, picture)), normalised(picture), atol=1e-6)

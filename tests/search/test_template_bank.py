@@ -35,7 +35,7 @@ def test_the_best_proposal_lies_within_the_fine_grids_covering(kind):
     assert error.max() < 4.0
     assert error.square().mean().sqrt() < 2.0
     assert found.score[found.offset[:-1]].min() > 0.88  # blurred borders of paint count in part
-    # The other reading of the matrix is no answer.
+    # The transpose is no answer.
     assert so3.geodesic_distance(found.R_view_body[found.offset[:-1]].mT, R_view_body).rad2deg().median() > 20
 
 
@@ -69,7 +69,7 @@ def test_a_finer_grid_answers_more_exactly():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_it_tells_a_mirrored_picture_and_a_mirrored_map_from_the_right_one(kind):
+def test_it_distinguishes_a_mirrored_picture_and_a_mirrored_map_from_the_right_one(kind):
     disks = clean_disks(kind, attitudes(10))
     mirrored_search = TemplateBank(texture_of(kind).flip(1), SIZE, OrientSettings())
 
@@ -268,7 +268,7 @@ def test_disks_of_another_size_are_refused_and_an_odd_size_is_rounded_up():
     assert best_errors_deg(search.propose(clean_disks("blobs", R_view_body)), R_view_body).max() < 4
 
 
-# --- what is no picture of the sphere
+# --- pictures without the sphere
 
 
 def test_noise_fits_everywhere_and_is_a_runaway():
@@ -302,7 +302,7 @@ def test_no_proposal_scores_below_score_min_and_those_above_stay():
     assert torch.equal(few.score, all_of_them.score[all_of_them.score >= 0.8])
 
 
-def test_a_disk_whose_best_is_below_score_min_says_so():
+def test_a_disk_whose_best_is_below_score_min_has_the_reason_low_score():
     search = TemplateBank(texture_of("blobs"), SIZE, OrientSettings(score_min=1.0))
     found = search.propose(clean_disks("blobs", attitudes(2)))
     assert found.reason == (Reason.LOW_SCORE,) * 2

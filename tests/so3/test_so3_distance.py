@@ -38,7 +38,7 @@ def test_the_printed_arccos_loses_small_angles_in_float32(rng, phi):
     assert (so3.angle(R) - phi).abs().max() < 1e-6 * phi  # all digits
     A = so3.random_rotations(200, generator=rng)
     B = (A @ R.double()).float()
-    assert (so3.geodesic_distance(A.float(), B) - phi).abs().max() < 4e-7  # what the rounding of A and B leaves
+    assert (so3.geodesic_distance(A.float(), B) - phi).abs().max() < 4e-7  # left by the rounding of A and B
     assert (printed_angle(A.float().mT @ B) - phi).abs().max() > 0.1 * phi
 
 

@@ -42,7 +42,7 @@ def test_exp_and_log_keep_all_digits_at_0_and_pi(rng, dtype, tolerance, turn):
     assert_close(torch.linalg.matrix_exp(so3.hat(back.double())), expected, atol=tolerance)
     if turn < 3:  # at pi either sign of the axis is right
         assert_close(back, rotvec, atol=tolerance)
-    if 0 < turn < 1:  # relative, not only absolute: a turn of 1e-9 is not lost
+    if 0 < turn < 1:  # relative, not only absolute: a rotation of 1e-9 is not lost
         assert ((back - rotvec).norm(dim=-1) / turn).max() < tolerance
 
 
@@ -82,7 +82,7 @@ def test_gradients_of_exp_and_log_agree_with_differences(rng):
     rotvec = torch.randn(4, 3, generator=rng, dtype=F64).requires_grad_()
     assert torch.autograd.gradcheck(so3.exp, rotvec)
     assert torch.autograd.gradcheck(so3.log, so3.exp(rotvec.detach()).requires_grad_())
-    # the last turns by 2.9 rad, where the quaternion's largest component is not w
+    # the last rotates by 2.9 rad, where the quaternion's largest component is not w
     far = (directions(rng, 5) * 2.9).requires_grad_()
     assert torch.autograd.gradcheck(lambda v: so3.log(so3.exp(v)), far)
 
@@ -103,7 +103,7 @@ def test_the_derivative_of_exp_at_0_is_hat():
     assert_close(jacobian.movedim(-1, 0), so3.hat(torch.eye(3, dtype=F64)))
 
 
-def test_what_was_not_measured_stays_nan_and_alone():
+def test_unmeasured_values_stay_nan_and_change_no_others():
     rotvec = torch.tensor([[0.1, 0.2, 0.3], [math.nan] * 3])
     R = so3.exp(rotvec)
     assert R[1].isnan().all()
@@ -125,7 +125,7 @@ def test_compiled_code_gives_what_torch_gives(rng, monkeypatch):
     assert torch.equal(found[1].nan_to_num(9.0), found[2].nan_to_num(9.0))
 
 
-def test_derivatives_are_asked_for_in_any_of_torchs_ways(rng):
+def test_derivatives_work_in_all_ways_of_torch(rng):
     rotvec = torch.randn(4, 3, generator=rng, dtype=F64)
     by_hand = torch.stack([torch.autograd.functional.jacobian(so3.exp, one) for one in rotvec])
     assert float(by_hand.abs().amax()) > 0.1

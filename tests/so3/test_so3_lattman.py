@@ -29,7 +29,7 @@ def count(steps, delta):
 
 
 def turned(theta, d_lattman):
-    """Angle by which a small change of Lattman angles turns."""
+    """Angle of the rotation by a small change of Lattman angles."""
     moved = so3.from_lattman(so3.to_lattman(theta) + d_lattman)
     return so3.geodesic_distance(so3.from_tait_bryan(theta), so3.from_tait_bryan(moved))
 
@@ -92,7 +92,7 @@ def test_every_rotation_is_near_one_of_the_grid(rng, degrees):
     distance = nearest_distance(so3.lattman_grid(step), R)
     assert distance.max() <= (0.5 + math.sqrt(0.5)) * step  # proved in the docstring
     assert distance.max() <= math.sqrt(3) / 2 * step  # measured: 0.78 to 0.83
-    assert distance.max() >= 0.7 * step  # and no finer than it says
+    assert distance.max() >= 0.7 * step  # and no finer than stated
 
 
 def test_only_the_last_row_holds_its_rotations_twice():
@@ -107,7 +107,7 @@ def test_only_the_last_row_holds_its_rotations_twice():
     assert apart.min() > math.radians(10)
 
 
-def test_the_grid_comes_in_the_dtype_asked_for_and_always_the_same(dtype, tolerance):
+def test_the_grid_has_the_given_dtype_and_is_always_the_same(dtype, tolerance):
     grid = so3.lattman_grid(STEP, dtype=dtype)
     assert grid.dtype == dtype
     assert torch.equal(grid, so3.lattman_grid(STEP, dtype=dtype))

@@ -67,7 +67,7 @@ def test_a_shell_on_the_rim_belongs_to_the_grid():
         assert len(so3.local_grid(step, 0.999 * nearest * step)) == 1
 
 
-def test_the_grid_comes_in_the_dtype_asked_for_and_always_the_same(dtype, tolerance):
+def test_the_grid_has_the_given_dtype_and_is_always_the_same(dtype, tolerance):
     grid = so3.local_grid(STEP, RADIUS, dtype=dtype)
     assert grid.dtype == dtype
     assert torch.equal(grid, so3.local_grid(STEP, RADIUS, dtype=dtype))

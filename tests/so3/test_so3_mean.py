@@ -11,7 +11,7 @@ F64 = torch.float64
 
 
 def cluster(rng, spread, shape=(100, 5), dtype=F64):
-    """Rotations that turn by at most `spread` from one each."""
+    """Rotations by at most `spread` from one each."""
     axis = torch.randn(*shape, 3, generator=rng, dtype=F64)
     v = axis / axis.norm(dim=-1, keepdim=True) * spread * torch.rand(*shape, 1, generator=rng, dtype=F64)
     return (so3.random_rotations((*shape[:-1], 1), generator=rng) @ so3.exp(v)).to(dtype)

@@ -61,7 +61,7 @@ def test_undecided_matrices_give_a_rotation_and_finite_gradients(dtype, toleranc
     assert M.grad.isfinite().all()
 
 
-def test_what_was_not_measured_stays_nan_and_alone(rng):
+def test_unmeasured_values_stay_nan_and_change_no_others(rng):
     R = so3.random_rotations(3, generator=rng)
     M = R.clone()
     M[1, 0, 0], M[2, 2, 2] = math.nan, math.inf

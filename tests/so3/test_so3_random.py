@@ -10,7 +10,7 @@ N = 20_000
 
 
 def haar(phi):
-    """Share of all rotations that turn by less than phi."""
+    """Share of all rotations by less than phi."""
     return (phi - torch.sin(torch.as_tensor(phi)).numpy()) / math.pi
 
 

@@ -20,7 +20,7 @@ def body_direction(longitude_deg: float, latitude_deg: float) -> Tensor:
 
 
 def random_map(rng: torch.Generator, height: int = 16) -> Tensor:
-    """Noise: no two texels alike, so that a look-up one texel off is seen."""
+    """Noise: no two texels alike, so that a look-up one texel off fails."""
     return torch.rand(height, 2 * height, generator=rng, dtype=torch.float64)
 
 

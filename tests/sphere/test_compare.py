@@ -1,4 +1,4 @@
-"""Maps compared: planted rotations, shifts and wear are found with their signs, and what is unknown stays so."""
+"""Maps compared: planted rotations, shifts and wear are found with their signs; unseen paint stays unknown."""
 
 import math
 
@@ -37,7 +37,7 @@ def test_turning_a_map_to_and_fro_changes_nothing_but_a_little_sharpness(paint):
 
 @pytest.mark.slow
 def test_a_planted_rotation_is_found(paint):
-    # What the reference shows at d, the turned map shows at R d.
+    # Paint at d of the reference is at R d of the rotated map.
     found = compare_maps(turned_map(paint, TURN.mT), paint)
     assert math.degrees(float(so3.geodesic_distance(found.R_other_reference, TURN))) < 0.05
     assert found.correlation > 0.99
@@ -50,7 +50,7 @@ def test_a_planted_rotation_is_found(paint):
 def test_a_planted_shift_is_found_where_it_is_with_its_direction(paint, brightness):
     gain, offset = brightness
     found = compare_maps(gain * warped(paint, 1.0) + offset, paint, turned=False)
-    # The warped map shows at d what lay at d + w x d, so paint of d lies at d - w x d in it.
+    # The warped map shows at d the paint of d + w x d, so paint of d is at d - w x d in it.
     d = found.direction_body
     moved = -torch.linalg.cross(shift_field(d, 1.0), d)
     planted = torch.stack([(moved * axis).sum(-1) for axis in compass(d)], dim=-1)
@@ -85,7 +85,7 @@ def test_the_shift_of_east_and_north_has_the_sign_of_the_map(paint):
 
 
 @pytest.mark.slow
-def test_what_either_map_does_not_know_is_not_told(paint):
+def test_unseen_paint_of_either_map_is_not_compared(paint):
     half = paint.clone()
     half[:, :HEIGHT] = torch.nan  # the western half
     found = compare_maps(turned_map(half, TURN.mT), paint)

@@ -1,4 +1,4 @@
-"""The renderer: camera's pictures and disks, gradients, batches; the smooth pictures for derivatives of fits."""
+"""The renderer: pictures of cameras and disks, gradients, batches; smooth pictures for derivatives of fits."""
 
 from dataclasses import replace
 
@@ -69,7 +69,7 @@ def test_from_far_away_a_cameras_picture_is_the_orthographic_one(texture, R):
     assert_close(view(camera.R_cam_lab @ R), there, atol=1e-4)
 
 
-def test_paint_and_background_have_the_levels_and_the_area_asked_for():
+def test_paint_and_background_have_their_given_levels_and_area():
     camera, position = near_camera(), f64(POSITIONS)
     R = torch.eye(3, dtype=torch.float64)
     render = SphereRenderer(torch.ones(8, 16), radius_mm=9.0, camera=camera)
@@ -87,7 +87,7 @@ def test_paint_and_background_have_the_levels_and_the_area_asked_for():
 
 
 def test_the_middle_of_the_disk_shows_what_faces_the_camera():  # convention
-    # One white spot about body +x, turned to the camera in its direct line of sight, not along its axis.
+    # One white spot about body +x, rotated to the camera in its direct line of sight, not along its axis.
     spot = (map_directions(256)[..., 0] > 0.97).double()
     camera, position = near_camera(), f64(POSITIONS)
     x_cam_mm = position @ camera.R_cam_lab.mT + camera.T_cam_lab_mm
@@ -141,7 +141,7 @@ def test_a_sphere_beyond_the_edge_is_cut_off_there(texture):
         assert_close(here, there[100:148, 100:148], atol=1e-9)
 
 
-def test_what_cannot_be_rendered_is_refused(texture, R):
+def test_impossible_scenes_are_refused(texture, R):
     with pytest.raises(SettingsError, match="got neither"):
         SphereRenderer(texture)
     with pytest.raises(SettingsError, match="got both"):
@@ -233,7 +233,7 @@ def test_the_picture_is_the_synthetic_movies_one():
     full = torch.from_numpy(cover) > 0.99
     assert miss.square().mean().sqrt() < 4.0  # of 150 grey levels from black to white
     assert miss[full].mean().abs() < 0.5
-    # East for west, or a turn by the inverse, is another picture.
+    # East for west, or a rotation by the inverse, is another picture.
     for other in (
         expected_grey(rays, place, R.mT, ball),
         expected_grey(rays, place, R, replace(ball, texture=ball.texture.flip(1))),

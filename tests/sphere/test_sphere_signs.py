@@ -94,7 +94,7 @@ TEXTURE = random_texture("blobs", 1, 128).double()
 
 
 @pytest.mark.parametrize(("right_deg", "down_deg"), AWAY)
-def test_off_the_axis_the_sphere_shows_the_side_that_R_cam_view_says(rng, right_deg, down_deg):
+def test_off_the_axis_the_sphere_shows_the_side_that_R_cam_view_gives(rng, right_deg, down_deg):
     R_lab_body = so3.random_rotations((), generator=rng)
     picture, camera, centre_lab = photograph(R_lab_body, right_deg, down_deg)
     centre_cam = camera.R_cam_lab @ centre_lab + camera.T_cam_lab_mm

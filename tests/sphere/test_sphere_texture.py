@@ -121,7 +121,7 @@ def test_inputs_stay_as_they_are(rng):
     assert torch.equal(direction, before[1])
 
 
-def test_what_is_no_map_and_what_is_no_direction_is_refused():
+def test_shapes_of_no_map_and_of_no_direction_are_refused():
     with pytest.raises(ShapeError, match=r"texture: .*got \(8, 15\)"):
         sample_texture(torch.zeros(8, 15), torch.zeros(1, 3))
     with pytest.raises(ShapeError, match=r"direction_body: expected shape \(\.\.\., 3\)"):

@@ -1,4 +1,4 @@
-"""The canonical view: which normal a pixel shows, and its pictures (docs/errata.md A4)."""
+"""The canonical view: normals of its pixels, and its pictures (docs/errata.md A4)."""
 
 import math
 from functools import partial
@@ -193,7 +193,7 @@ def test_it_agrees_with_a_lookup_in_numpy_pixel_by_pixel(rng, dtype, view_of):
         assert (got[~view.inside] == -1.0).all()
         expected = looked_up(texture, torch.stack([R.T @ n for n in view.normal_view.double()]))
         assert_close(got[view.inside].double(), torch.from_numpy(expected), atol=atol)
-        # The transpose is another attitude, and seen.
+        # The transpose is another attitude, with another picture.
         transposed = torch.from_numpy(looked_up(texture, view.normal_view.double() @ R.T))
         assert (got[view.inside].double() - transposed).abs().mean() > 0.1
 
@@ -202,7 +202,7 @@ def test_turning_the_body_about_the_line_of_sight_turns_the_picture(rng):
     view = orthographic_view(20, torch.float64)
     render = partial(view.render, random_map(rng))
     R_view_body = so3.random_rotations((), generator=rng)
-    # z points away from the camera, y down: a turn by +90 degrees takes right to down, clockwise for the view.
+    # z points away from the camera, y down: a rotation by +90 degrees takes right to down, clockwise for the view.
     turned = render(so3.exp(f64([0, 0, math.pi / 2])) @ R_view_body)
     assert_close(turned, render(R_view_body).rot90(-1), atol=1e-12)
 
@@ -216,7 +216,7 @@ def test_gradients_are_right_in_the_orientation_and_in_the_map(rng):
 
 def test_the_pictures_slope_is_the_turning_of_the_map(rng):
     # Grey = latitude: turning about the view's x axis by a small angle moves the paint along the meridian through the
-    # disk's middle by that angle, whatever the interpolation.
+    # disk's middle by that angle, with any interpolation.
     height = 180
     latitude = math.pi / 2 - math.pi * (torch.arange(height, dtype=torch.float64) + 0.5) / height
     texture = latitude[:, None].expand(height, 2 * height)
@@ -226,7 +226,7 @@ def test_the_pictures_slope_is_the_turning_of_the_map(rng):
     delta = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     middle = render(so3.exp(delta) @ R_view_body)[5, 5]
     (gradient,) = torch.autograd.grad(middle, delta)
-    # A turn about x right takes y down to z away: what faces the camera (-z) moves down (+y), what lay north comes in.
+    # A rotation about x takes y down to z away: paint facing the camera (-z) moves down (+y), northern paint comes in.
     assert_close(gradient, f64([1, 0, 0]), atol=1e-6)
 
 
@@ -259,6 +259,6 @@ def test_a_batch_is_the_stack_of_its_singles(rng, dtype, tolerance, batch):
         assert_close(render(R), expected, atol=20 * tolerance)
 
 
-def test_what_is_no_rotation_matrix_is_refused(rng):
+def test_a_matrix_that_is_no_rotation_is_refused(rng):
     with pytest.raises(ShapeError, match="R_view_body"):
         orthographic_view(8).render(random_map(rng), torch.zeros(3, 4))

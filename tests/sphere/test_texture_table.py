@@ -1,4 +1,4 @@
-"""The blurred paint and its slope, against blurring by brute force and against what a Gaussian does to harmonics."""
+"""The blurred paint and its slope, against blurring by brute force and harmonics under a Gaussian."""
 
 import math
 from functools import cache
@@ -25,7 +25,7 @@ from sphereorient.synth import random_texture
 HEIGHT = 256
 BLURS = [BASE_RAD, 0.017, 0.03, 0.07]  # rad: the finest, 80 px sharp, the middle and the coarse level of refinement
 FAR = 4.3  # / side: no direction is further from the middle of its cell, rad; the faces' middles have the longest cells
-# What the tables are right to, in steps from black to white and in the slope of a straight border: tangent planes a
+# Accuracy of the tables, in steps from black to white and in the slope of a straight border: tangent planes a
 # cell wide, and wider blurs made with nine nodes.
 VALUE_RMS, VALUE_MOST = 0.008, 0.05
 SLOPE_RMS, SLOPE_MOST = 0.08, 0.4
@@ -293,7 +293,7 @@ def test_a_map_that_is_turned_gives_a_table_that_is_turned():
     value_t, slope_t = looked(turned, at @ quarter.mT)
     assert (value_t - value).square().mean().sqrt() < VALUE_RMS
     assert (slope_t - slope @ quarter.mT).square().mean().sqrt() < SLOPE_RMS / (math.sqrt(2 * math.pi) * 0.03)
-    # Turned the other way it is another ball.
+    # Rotated the other way it is another ball.
     assert (looked(turned, at @ quarter)[0] - value).square().mean().sqrt() > 0.3
 
 

@@ -25,12 +25,12 @@ LAB = Rotation.from_euler("xyz", [0.5, -1.0, 0.3]).as_matrix()
 
 
 def turned(turns: np.ndarray) -> np.ndarray:
-    """Orientations (N, 3, 3) after turns (N, 3), lab."""
+    """Orientations (N, 3, 3) after rotations (N, 3), lab."""
     return np.stack(list(accumulate(Rotation.from_rotvec(turns).as_matrix(), lambda R, T: T @ R)))
 
 
 def turns_of(frames: int, seed: int = 0) -> np.ndarray:
-    """Turns of a ball on which an animal walks ahead and turns, correlated over 15 frames."""
+    """Rotations of a ball on which an animal walks ahead and turns, correlated over 15 frames."""
     noise = np.random.default_rng(seed).normal(size=(frames + 100, 3))
     slow = lfilter([np.sqrt(1 - 0.935**2)], [1, -0.935], noise, axis=0)[100:]
     return 0.04 * slow + np.array([0.0, 0.05, 0.0])
@@ -90,7 +90,7 @@ def test_the_interval_holds_the_gain(exact):
     assert (np.mean(held, axis=0) > 0.85).all()
 
 
-def test_of_another_trackers_noise_the_gain_is_free_where_ours_is_as_large_and_lies_in_the_bounds():
+def test_the_gain_is_free_of_another_trackers_noise_where_ours_is_as_large_and_lies_in_the_bounds():
     rng, turns = np.random.default_rng(3), turns_of(4000)
     ours, theirs = (moved(errors(4000, rng, 0.0, 8e-3), turned(turns * g)) for g in ([1.0, 0.97, 1.0], [1.0, 1.0, 1.0]))
     found = compared(ours, theirs, exact=False)
@@ -130,7 +130,7 @@ def test_a_drift_beyond_a_half_turn_is_unwrapped():
     np.testing.assert_allclose(found.drift_deg_min, [0.0, np.rad2deg(6.0), 0.0], atol=10.0)
 
 
-def test_alignment_takes_off_a_constant_turn_of_the_lab_and_only_where_it_is_asked_for():
+def test_alignment_removes_a_constant_rotation_of_the_lab_and_only_by_its_option():
     turns = turns_of(600)
     ours, theirs = turned(turns * [1.0, 0.97, 1.0]) @ BODY, turned(turns)
     found = compared(ours, LAB @ theirs, align=True, exact=False)  # axes of the track
@@ -163,7 +163,7 @@ def test_lost_frames_and_gaps_in_time_are_not_spanned():
     track = track_of(true)
     later = np.arange(400) / RATE + 0.2 * (np.arange(400) >= 100)  # six frames dropped before frame 100
     wrong = true.copy()
-    wrong[100:] = true[100:] @ BODY  # what happened there is not compared
+    wrong[100:] = true[100:] @ BODY  # the frames there are not compared
     found = behaviour_of(replace(track, time=later, orientation=wrong), Reference(R_lab_body=true))
     assert found.pairs == 398
     np.testing.assert_allclose(found.gain.value, 1.0, atol=1e-9)
@@ -224,13 +224,13 @@ def test_smoothing_keeps_the_gain_of_a_ball_that_an_animal_turns():
         segment=torch.zeros(400, dtype=torch.int64),
     )
     found = smooth_motion(poses, SmoothSettings())
-    # Its rate is forgotten at once: the stated errors stay as they are, but for the share that lasts.
+    # A rate without memory: the stated errors stay, but for the share that lasts.
     assert found.orientation_scale == pytest.approx(1 / (1 - SmoothSettings().slow_share) ** 0.5)
     off = so3.geodesic_distance(found.R_lab_body, torch.from_numpy(true))
     assert float(off.median()) < 2.5 * sigma
 
 
-def test_a_smoother_that_loses_motion_shows_it_whatever_the_noise_of_the_reference():
+def test_a_smoother_that_loses_motion_shows_it_at_any_noise_of_the_reference():
     rng, turns = np.random.default_rng(3), turns_of(4000)
     theirs = moved(errors(4000, rng, 0.0, 8e-3), turned(turns))
     track = track_of(turned(turns), orientation_smooth=turned(0.98 * turns))

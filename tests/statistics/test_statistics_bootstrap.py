@@ -59,14 +59,14 @@ def test_positive_quantities_have_positive_ends_and_do_not_depend_on_the_unit():
     np.testing.assert_allclose(other.high, 10 * found.high, rtol=1e-6)
 
 
-def test_groups_do_not_know_of_each_other():
+def test_groups_do_not_depend_on_each_other():
     rng = np.random.default_rng(5)
     a, b = (sums_of(rng.standard_normal((60, 3))) for _ in range(2))
     both = studentized(np.concatenate([a, b], axis=1), mean_and_size, POSITIVE, SETTINGS)
     np.testing.assert_allclose(both.high[1], studentized(b, mean_and_size, POSITIVE, SETTINGS).high[0], rtol=1e-9)
 
 
-def test_what_cannot_be_computed_is_nan_and_a_constant_has_no_width():
+def test_an_undefined_statistic_is_nan_and_a_constant_has_no_width():
     sums = sums_of(np.ones((30, 2)))
     found = studentized(sums, lambda t: mean_and_size(t) - [0.0, 2.0], POSITIVE, SETTINGS)
     assert found.low[0, 0] == pytest.approx(1)

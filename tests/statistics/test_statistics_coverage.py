@@ -10,7 +10,7 @@ from sphereorient.statistics.settings import BootstrapSettings
 
 
 @pytest.mark.slow
-def test_intervals_hold_the_nominal_values_as_often_as_they_say():
+def test_intervals_hold_the_nominal_values_as_often_as_stated():
     spec = EnsembleSpec(mean_frames=100.0)
     truth = coverage.truths(spec)
     few = BootstrapSettings(resamples=300)

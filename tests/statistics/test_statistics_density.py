@@ -70,7 +70,7 @@ def test_the_fit_agrees_with_a_search_on_the_exact_likelihood():
 
 
 @pytest.mark.slow
-def test_its_intervals_hold_the_planted_width_as_often_as_they_say():
+def test_its_intervals_hold_the_planted_width_as_often_as_stated():
     held = 0
     for seed in range(100):
         fit = fit_stretched(planted(0.6, 6000, seed), np.arange(6000) // 60, 100, FEW)
@@ -106,11 +106,11 @@ def test_a_noisy_density_is_the_convolution():
 
 
 @pytest.mark.slow
-def test_the_fit_sees_through_noise_that_it_is_told_of():
+def test_the_fit_corrects_for_noise_of_known_share():
     rng = np.random.default_rng(11)
     x = planted(0.7, 200_000, 11)
     noisy = x + np.sqrt(0.05) * x.std() * rng.standard_normal(len(x))
     segment = np.arange(200_000) // 1000
-    told, untold = (fit_stretched(noisy, segment, 200, FEW, share) for share in (0.05 / 1.05, 0.0))
-    assert float(told.a.value) == pytest.approx(0.7, abs=0.01)
-    assert float(untold.a.value) < 0.68
+    corrected, uncorrected = (fit_stretched(noisy, segment, 200, FEW, share) for share in (0.05 / 1.05, 0.0))
+    assert float(corrected.a.value) == pytest.approx(0.7, abs=0.01)
+    assert float(uncorrected.a.value) < 0.68

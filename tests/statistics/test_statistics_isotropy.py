@@ -27,7 +27,7 @@ def verdict(spec: EnsembleSpec) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("frame", ["lab", "body"])
-def test_the_frame_that_has_axes_is_told_from_the_other(frame):  # docs/errata.md E6
+def test_the_frame_that_has_axes_is_distinguished_from_the_other(frame):  # docs/errata.md E6
     assert verdict(EnsembleSpec(segments=200, mean_frames=120, frame=frame, **UNEQUAL)) == frame
 
 
@@ -111,7 +111,7 @@ def test_size_on_independent_attitudes():
 
 
 def walks(rng: np.random.Generator, segments: int = 120) -> tuple[np.ndarray, np.ndarray]:
-    """Uniform starts and slow random turns in segments of unequal length."""
+    """Uniform starts and slow random rotations in segments of unequal length."""
     lengths = 20 + rng.geometric(1 / 30, segments)
     segment = np.repeat(np.arange(segments), lengths)
     R = np.empty((len(segment), 3, 3))

@@ -47,7 +47,7 @@ def test_equal_samples_within_a_segment_widen_the_interval_as_if_they_were_one()
 
 
 @pytest.mark.slow
-def test_intervals_of_a_skewed_mean_hold_it_as_often_as_they_say():
+def test_intervals_of_a_skewed_mean_hold_it_as_often_as_stated():
     rng = np.random.default_rng(4)
     held = 0
     for _ in range(400):
@@ -74,7 +74,7 @@ def test_sums_by_segment_add_up():
 
 
 def noisy(share: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Intermittent motion with a flatness of 6, what a noise adds, and the noise's sigma."""
+    """Intermittent motion with a flatness of 6, its noise, and the noise's sigma."""
     rng = np.random.default_rng(7)
     motion = rng.laplace(0, np.sqrt(0.5), (400_000, 3))
     sigma = np.sqrt(share)
@@ -82,7 +82,7 @@ def noisy(share: float) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 @pytest.mark.slow
-def test_what_a_kernel_let_through_is_taken_off():
+def test_noise_that_a_kernel_let_through_is_subtracted():
     _, measured, sigma = noisy(0.3)
     found = moments(ensemble([4000] * 100, velocity=measured, sigma=sigma), "velocity", FEW)
     np.testing.assert_allclose(found.corrected_rms.value[:3], 1.0, rtol=0.01)
@@ -90,7 +90,7 @@ def test_what_a_kernel_let_through_is_taken_off():
     np.testing.assert_allclose(found.noise_share.value[:3], 0.3 / 1.3, rtol=0.02)
 
 
-def test_what_a_smoother_removed_is_put_back():
+def test_motion_that_a_smoother_removed_is_added_again():
     # a best estimate of normal motion from noisy data: its own variance and its error's make up the motion's
     rng = np.random.default_rng(8)
     motion = rng.standard_normal((200_000, 3))
@@ -104,7 +104,7 @@ def test_what_a_smoother_removed_is_put_back():
 
 @pytest.mark.slow
 def test_noise_that_a_smoother_let_through_does_not_flatten_heavy_tails():
-    # what LET_THROUGH says of the error is noise: a shrunk motion plus noise of that variance
+    # LET_THROUGH is the error's share of noise: a shrunk motion plus noise of that variance
     rng = np.random.default_rng(9)
     motion = rng.laplace(0, np.sqrt(0.5), (400_000, 3))
     sigma = 0.3

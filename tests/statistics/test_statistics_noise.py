@@ -28,7 +28,7 @@ def track(true):
 @pytest.mark.parametrize(
     ("quantity", "noise"), [("acceleration", NOISE_MM * 1e-3), ("alpha_lab", np.radians(NOISE_DEG))]
 )
-def test_many_lags_tell_the_motions_variance_from_the_noise(true, track, quantity, noise):
+def test_many_lags_separate_the_motions_variance_from_the_noise(true, track, quantity, noise):
     found = multi_lag([track], quantity, settings=FEW)
     exact = np.sqrt(np.square(getattr(true, quantity)).mean(0))
     np.testing.assert_allclose(found.rms, exact, rtol=0.03)
@@ -66,7 +66,7 @@ def test_flatness_of_alpha_is_recovered_by_the_narrowest_kernels_and_lost_by_wid
     assert found.corrected_flatness.value[0].mean() == pytest.approx(exact.mean(), rel=0.1)
 
 
-def test_foretold_noise_is_what_a_standing_sphere_shows(track):
+def test_predicted_noise_is_what_a_standing_sphere_shows(track):
     rng = np.random.default_rng(6)
     still = replace(track, position=NOISE_MM * rng.standard_normal(track.position.shape))
     found = width_curve([still], "acceleration", settings=FEW)

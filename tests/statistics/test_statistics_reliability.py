@@ -13,7 +13,7 @@ def calibrated(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return probability, rng.random(count) < probability
 
 
-def test_what_comes_as_often_as_said_has_an_error_of_chance_alone():
+def test_outcomes_as_frequent_as_stated_have_an_error_of_chance_alone():
     curve = reliability(*calibrated(20_000))
     assert curve.error < 2 * curve.chance < 0.02
     inside = (curve.low <= curve.probability) & (curve.probability <= curve.high)
@@ -30,11 +30,11 @@ def test_intervals_hold_what_is_true_95_times_in_100():
 
 @pytest.mark.parametrize(("power", "sign"), [(3.0, -1), (1 / 3, 1)], ids=["overconfident", "underconfident"])
 def test_the_error_of_planted_misfits_is_the_mean_distance(power, sign):
-    said, _ = calibrated(50_000, 1)
+    stated, _ = calibrated(50_000, 1)
     rng = np.random.default_rng(2)
-    true = said**power
-    curve = reliability(said, rng.random(len(said)) < true, bins=20)
-    assert curve.error == pytest.approx(np.abs(true - said).mean(), abs=0.005)
+    true = stated**power
+    curve = reliability(stated, rng.random(len(stated)) < true, bins=20)
+    assert curve.error == pytest.approx(np.abs(true - stated).mean(), abs=0.005)
     assert (sign * (curve.share - curve.probability)[2:-2] > 0).all()
     assert curve.error > 10 * curve.chance
 
@@ -63,10 +63,10 @@ def test_bins_hold_equal_counts_and_equal_probabilities_stay_together():
 
 def test_the_order_of_the_outcomes_does_not_matter_also_among_equal_probabilities():
     rng = np.random.default_rng(3)
-    said = np.round(rng.random(500), 1)
-    came = rng.random(500) < said
+    stated = np.round(rng.random(500), 1)
+    came = rng.random(500) < stated
     mixed = rng.permutation(500)
-    a, b = reliability(said, came), reliability(said[mixed], came[mixed])
+    a, b = reliability(stated, came), reliability(stated[mixed], came[mixed])
     assert a.error == pytest.approx(b.error, abs=1e-12)
     np.testing.assert_allclose(a.share, b.share)
 
@@ -88,9 +88,9 @@ def test_probabilities_that_are_nan_are_left_out_and_none_is_data():
 
 
 @pytest.mark.parametrize(
-    ("said", "came", "bins"),
+    ("stated", "came", "bins"),
     [([0.1], [True, False], 10), ([1.5], [True], 10), ([-0.1], [True], 10), ([0.1], [True], 0)],
 )
-def test_impossible_sets_are_refused(said, came, bins):
+def test_impossible_sets_are_refused(stated, came, bins):
     with pytest.raises(ShapeError, match="expected"):
-        reliability(said, came, bins)
+        reliability(stated, came, bins)

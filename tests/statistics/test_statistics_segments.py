@@ -72,7 +72,7 @@ def test_part_of_an_ensemble_has_the_segments_in_order():
         ([track([60, 60]), track([60, 60], method="paper")], "one method"),
     ],
 )
-def test_what_cannot_be_a_sample_is_refused_in_one_line(tracks, words):
+def test_an_impossible_sample_is_refused_in_one_line(tracks, words):
     with pytest.raises(TrackError, match=words) as caught:
         ensemble_of(tracks)
     assert "\n" not in str(caught.value)
@@ -110,7 +110,7 @@ def test_long_segments_are_cut_into_equal_pieces():
     assert (found.span_s <= 201 * STEP_S).all()
 
 
-def test_of_one_segment_an_ensemble_only_where_it_is_asked_for():
+def test_an_ensemble_of_one_segment_only_by_its_option():
     with pytest.raises(TrackError, match=r"two segments.*got 1.*max_duration_s"):
         ensemble_of(track([60]))
     assert ensemble_of(track([60]), fewest=1).segments == 1

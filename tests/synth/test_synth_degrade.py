@@ -1,4 +1,4 @@
-"""Degradations of pictures: each has the size that its unit says, and nothing of it is nothing."""
+"""Degradations of pictures: each has the size of its unit, and severity 0 changes nothing."""
 
 import math
 import subprocess
@@ -70,7 +70,7 @@ def test_an_unknown_name_is_refused_with_the_nearest_one():
         assert "\n" not in str(refused.value)
 
 
-def test_what_does_not_act_on_pictures_is_refused_there():
+def test_degradations_that_do_not_act_on_pictures_are_refused_there():
     with pytest.raises(SettingsError, match="write_degraded"):
         only("spin", 5.0, ball())
 
@@ -84,7 +84,7 @@ def test_impossible_values_are_refused(name, value):
         only(name, value, ball())
 
 
-def test_what_is_no_picture_is_refused():
+def test_impossible_arguments_are_refused():
     for wrong in (torch.zeros(5), torch.zeros(5, 5, dtype=torch.uint8)):
         with pytest.raises(ShapeError, match="pass grey levels as floats"):
             degrade(wrong, disk(), {}, seeded())
@@ -93,7 +93,7 @@ def test_what_is_no_picture_is_refused():
 
 
 @pytest.mark.slow
-def test_the_page_is_what_the_table_says():
+def test_the_page_is_that_of_the_table():
     run = [sys.executable, REPO / "scripts" / "figure_degradations.py", "--check"]
     subprocess.run(run, check=True)
     text = (REPO / "docs" / "degradations.md").read_text()
@@ -141,7 +141,7 @@ def test_the_same_seed_gives_the_same_bytes_and_the_input_stays(name):
     before = picture.clone()
     torch.manual_seed(1)
     first = only(name, severity(name, 4), picture)
-    torch.manual_seed(2)  # torch's own numbers have no say
+    torch.manual_seed(2)  # torch's own generator does not matter
     assert torch.equal(only(name, severity(name, 4), picture), first)
     assert torch.equal(picture, before)
     random = name not in ("contrast_loss", "defocus", "saturation")
@@ -194,9 +194,9 @@ def test_noise_has_its_standard_deviation_at_each_grey_level():
     for level in (25.0, 100.0):
         many = flat(level, torch.float64).expand(8, SIZE, SIZE)  # 74,000 pixels: 0.3 % of sigma
         read = degrade(many, disk((8,)), {"read_noise": 7.0}, seeded()) - level
-        shot = degrade(many, disk((8,)), {"shot_noise": 0.8}, seeded()) - level
+        noise = degrade(many, disk((8,)), {"shot_noise": 0.8}, seeded()) - level
         assert float(read.std()) == pytest.approx(7.0, rel=0.02)
-        assert float(shot.std()) == pytest.approx(0.8 * math.sqrt(level), rel=0.02)
+        assert float(noise.std()) == pytest.approx(0.8 * math.sqrt(level), rel=0.02)
         assert abs(float(read.mean())) < 0.1
         neighbours = (read[..., 1:] * read[..., :-1]).mean() / read.var()
         assert abs(float(neighbours)) < 0.02
@@ -273,7 +273,7 @@ def test_occlusion_hides_its_share_of_the_disk(share):
         assert float(hidden.sum()) <= math.pi * RADIUS**2 * 1.01  # as large as the ball
 
 
-def test_bubbles_are_as_many_as_said_before_the_disk():
+def test_the_number_of_bubbles_before_the_disk_is_the_severity():
     white = torch.full((500, 500), 100.0)
     where = Disk(centre_px=torch.tensor([250.0, 250.0]), radius_px=torch.tensor(230.0))
     for count in (2, 5):
@@ -285,7 +285,7 @@ def test_bubbles_are_as_many_as_said_before_the_disk():
 
 
 @pytest.mark.parametrize("radius", [2.0, 7.0])
-def test_dirt_covers_what_its_radius_says(radius):
+def test_dirt_covers_the_area_of_its_radius(radius):
     many = flat(200.0).expand(40, SIZE, SIZE)
     got = degrade(many, disk((40,)), {"dirt": radius}, seeded())
     # Middles scattered at random: a place stays clean with the probability of no middle within the radius.
@@ -314,7 +314,7 @@ def test_a_gain_never_darkens_and_needs_white_paint():
     assert_close(gain_to_clip(grey, white, 1 / 3), torch.tensor([255 / 200, 1.0, 1.0]), atol=1e-6)
 
 
-def test_as_many_frames_are_lost_as_said_others_in_each_movie():
+def test_the_number_of_lost_frames_is_the_severity_and_differs_by_movie():
     lost = lost_frames(torch.empty(3, 40), 0.15, seeded())
     assert (lost.sum(-1) == 6).all()
     assert not torch.equal(lost[0], lost[1])
@@ -322,7 +322,7 @@ def test_as_many_frames_are_lost_as_said_others_in_each_movie():
     assert int(lost_frames(torch.empty(24), 0.02, seeded()).sum()) == 1  # before: none
 
 
-def test_a_wrong_disk_is_wrong_by_what_is_said():
+def test_a_wrong_disk_is_wrong_by_the_severity():
     true = disk((500,), torch.float64)
     off = centre_error(true, 2.0, seeded()).centre_px - true.centre_px
     assert_close(off.norm(dim=-1), torch.full((500,), 2.0, dtype=torch.float64))

@@ -1,4 +1,4 @@
-"""Degraded experiments: the truth stays true, and the files are wrong by as much as the unit says."""
+"""Degraded experiments: the truth stays, and the files are wrong by as much as the unit states."""
 
 import math
 from pathlib import Path
@@ -79,7 +79,7 @@ def test_without_degradations_the_files_are_those_of_synth(plain, tmp_path):
 @pytest.mark.parametrize(
     "name", [name for name, row in DEGRADATIONS.items() if row.where in ("picture", "frame", "map", "movie")]
 )
-def test_what_spoils_pictures_spoils_the_movies_and_nothing_that_is_told(name, plain, tmp_path):
+def test_degradations_of_pictures_change_the_movies_and_no_input_file(name, plain, tmp_path):
     path = write_degraded(tmp_path, SETTINGS, {name: 5})
     assert same_truth(path, plain)
     for same in ("experiment.yaml", "cameras.yaml", "texture.png"):
@@ -90,13 +90,13 @@ def test_what_spoils_pictures_spoils_the_movies_and_nothing_that_is_told(name, p
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name, row in DEGRADATIONS.items() if row.where == "reported"])
-def test_what_is_told_wrong_changes_neither_truth_nor_movies(name, plain, tmp_path):
+def test_wrong_input_files_change_neither_truth_nor_movies(name, plain, tmp_path):
     path = write_degraded(tmp_path, SETTINGS, {name: 4})
     assert same_truth(path, plain)
     for camera, frames in frames_of(plain).items():
         assert np.array_equal(frames_of(path)[camera], frames)
-    told = ("experiment.yaml", "cameras.yaml", "texture.png")
-    changed = [file for file in told if (tmp_path / file).read_bytes() != (plain.parent / file).read_bytes()]
+    given = ("experiment.yaml", "cameras.yaml", "texture.png")
+    changed = [file for file in given if (tmp_path / file).read_bytes() != (plain.parent / file).read_bytes()]
     assert changed == [{"radius_error": "experiment.yaml", "texture_error": "texture.png"}.get(name, "cameras.yaml")]
 
 
@@ -159,7 +159,7 @@ def test_the_optics_blur_the_light_of_the_ball(name, tmp_path):  # the other ord
 
 
 @pytest.mark.slow
-def test_what_passes_by_moves_and_is_not_in_the_picture_without_the_ball(plain, tmp_path):
+def test_bubbles_move_and_are_not_in_the_picture_without_the_ball(plain, tmp_path):
     for name in ("occlusion", "bubbles"):
         path = write_degraded(tmp_path / name, SETTINGS, {name: 5})
         assert (empty_of(path) == 15).all()
@@ -234,7 +234,7 @@ def test_spin_is_the_rms_turn_from_frame_to_frame_and_smears_no_more(degrees):
     time_s = torch.arange(3000, dtype=torch.float64) / settings.frame_rate
     R = motion_of(settings).at(time_s).R_lab_body
     turn = torch.rad2deg(so3.log(R[1:] @ R[:-1].mT).norm(dim=-1))
-    # Between frames omega turns too, and the chord is shorter: a few per cent at 60 degrees.
+    # Between frames omega changes too, and the chord is shorter: a few per cent at 60 degrees.
     assert float(turn.square().mean().sqrt()) == pytest.approx(degrees, rel=0.04)
     assert settings.exposure * settings.omega_rms == pytest.approx(SETTINGS.exposure * SETTINGS.omega_rms)
 
@@ -298,10 +298,10 @@ def test_patches_are_patches_seamless_and_anywhere():
 @pytest.mark.slow
 def test_the_given_map_differs_from_the_filmed_one_by_its_share(plain, tmp_path):
     path = write_degraded(tmp_path, SETTINGS, {"texture_error": 4})
-    told, true = (load_texture(p.parent / "texture.png") for p in (path, plain))
+    given, true = (load_texture(p.parent / "texture.png") for p in (path, plain))
     area = map_directions(512)[..., :2].norm(dim=-1)
-    differs = (told - true).abs() > 0.02
-    assert_close(told[differs], (1 - true)[differs], atol=1e-6)
+    differs = (given - true).abs() > 0.02
+    assert_close(given[differs], (1 - true)[differs], atol=1e-6)
     # Where the map is grey, exchanging black and white changes little: 2 % of its area.
     assert float((area * differs).sum() / area.sum()) == pytest.approx(severity("texture_error", 4), abs=0.01)
 
@@ -320,22 +320,22 @@ def test_worn_paint_is_on_the_filmed_ball_only():
 @pytest.mark.slow
 def test_the_reported_diameter_is_too_large_by_px_at_the_rim(tmp_path):
     path = write_synthetic_experiment(tmp_path, SETTINGS, values={"radius_error": 2.0})
-    told = load_experiment(path)
-    assert told.diameter_mm == pytest.approx(18.0 * (20 + 2) / 20)
-    disk = picture_of_ball(told.cameras["cam1"], torch.zeros(3, dtype=torch.float64), told.diameter_mm / 2)
+    given = load_experiment(path)
+    assert given.diameter_mm == pytest.approx(18.0 * (20 + 2) / 20)
+    disk = picture_of_ball(given.cameras["cam1"], torch.zeros(3, dtype=torch.float64), given.diameter_mm / 2)
     assert float(disk.radius_px) == pytest.approx(22.0, rel=1e-3)
 
 
 @pytest.mark.slow
-def test_told_principal_points_are_off_in_opposite_directions_and_lines_of_sight_miss(plain, tmp_path):
+def test_given_principal_points_are_off_in_opposite_directions_and_lines_of_sight_miss(plain, tmp_path):
     path = write_synthetic_experiment(tmp_path, SETTINGS, values={"centre_error": 2.0})
     off = {name: tsai(path, name).centre_px - tsai(plain, name).centre_px for name in ("cam1", "cam2")}
     for shift in off.values():
         assert float(shift.norm()) == pytest.approx(2.0)
     assert_close(off["cam1"], -off["cam2"])
-    # Both pictures' columns lie along lab x: there the told lines of sight miss each other.
-    told, truth = load_experiment(path).cameras, truth_of(path)
-    lines = [told[name].rays(torch.from_numpy(truth[f"{name}/centre_px"])) for name in told]
+    # Both pictures' columns lie along lab x: there the given lines of sight miss each other.
+    given, truth = load_experiment(path).cameras, truth_of(path)
+    lines = [given[name].rays(torch.from_numpy(truth[f"{name}/centre_px"])) for name in given]
     across = torch.linalg.cross(lines[0].direction_lab, lines[1].direction_lab)
     across = across / across.norm(dim=-1, keepdim=True)
     miss_mm = ((lines[0].origin_lab_mm - lines[1].origin_lab_mm) * across).sum(-1).abs()
@@ -343,23 +343,23 @@ def test_told_principal_points_are_off_in_opposite_directions_and_lines_of_sight
 
 
 def test_an_odd_seed_turns_the_first_camera():
-    """Before: only the second, and the first is believed where they contradict each other."""
+    """Before: only the second, and `track` prefers the first where they contradict each other."""
     true = default_cameras(SETTINGS)
     for seed, turned, kept in ((1, "cam1", "cam2"), (2, "cam2", "cam1")):
-        told = wrong_cameras(true, {"camera_rotation": 5.0}, seed)
-        turn = so3.log(told[turned].R_cam_lab @ true[turned].R_cam_lab.mT)
+        given = wrong_cameras(true, {"camera_rotation": 5.0}, seed)
+        turn = so3.log(given[turned].R_cam_lab @ true[turned].R_cam_lab.mT)
         assert math.degrees(float(turn.norm())) == pytest.approx(5)
-        assert torch.equal(told[kept].R_cam_lab, true[kept].R_cam_lab)
+        assert torch.equal(given[kept].R_cam_lab, true[kept].R_cam_lab)
 
 
 @pytest.mark.slow
-def test_the_told_second_camera_is_turned_by_degrees_about_the_origin_and_moved_by_mm(plain, tmp_path):
+def test_the_given_second_camera_is_rotated_by_degrees_about_the_origin_and_moved_by_mm(plain, tmp_path):
     path = write_synthetic_experiment(tmp_path, SETTINGS, values={"camera_rotation": 1.5, "camera_shift": 0.3})
-    true, told = tsai(plain, "cam2"), tsai(path, "cam2")
-    turn = so3.log(told.R_cam_lab @ true.R_cam_lab.mT)
+    true, given = tsai(plain, "cam2"), tsai(path, "cam2")
+    turn = so3.log(given.R_cam_lab @ true.R_cam_lab.mT)
     assert math.degrees(float(turn.norm())) == pytest.approx(1.5)
     assert_close(turn, turn[:1].expand(3), atol=1e-9)
-    assert_close(told.T_cam_lab_mm - true.T_cam_lab_mm, torch.tensor([0.3, 0.0, 0.0]).double(), atol=1e-6)
+    assert_close(given.T_cam_lab_mm - true.T_cam_lab_mm, torch.tensor([0.3, 0.0, 0.0]).double(), atol=1e-6)
     for part in ("R_cam_lab", "T_cam_lab_mm", "centre_px"):
         assert torch.equal(getattr(tsai(path, "cam1"), part), getattr(tsai(plain, "cam1"), part))
     only_turned = wrong_cameras(default_cameras(SETTINGS), {"camera_rotation": 5.0})["cam2"]

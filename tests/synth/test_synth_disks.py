@@ -1,4 +1,4 @@
-"""Single balls as a proposer wants them: where paint appears, what degradations do, the same for the same seed."""
+"""Single balls for a proposer: position of the paint, effect of degradations, the same for the same seed."""
 
 import math
 
@@ -40,7 +40,7 @@ def noiseless(monkeypatch):
 
 
 def dark_place(disk: Tensor) -> NDArray[np.float64]:
-    """Where the dot is, (right, down) in radii: mean of what is darkest for the light about it."""
+    """Where the dot is, (right, down) in radii: mean of the darkest pixels relative to the light about them."""
     inside = np.hypot(*np.moveaxis(AT, -1, 0)) < 0.85
     grey = disk.numpy()
     low = inside & (grey < 0.5 * (grey[inside].min() + np.median(grey[inside])))
@@ -112,7 +112,7 @@ def test_the_outline_is_the_pictures_border():
 
 
 def test_errors_of_the_outline_move_and_stretch_the_picture():
-    """Twenty pictures scatter by what the settings say: 0.5 px of a radius of 39 px."""
+    """Twenty pictures scatter by the settings' 0.5 px of a radius of 39 px."""
     dot = dotted(torch.tensor([0.0, 0, -1]))
     loose = DiskSettings(centre_sigma_px=2.0, radius_sigma=0.0)
     places = np.stack([dark_place(d) for d in film_disks(dot, torch.eye(3).expand(60, 3, 3), {}, seeded(), loose)])
@@ -178,7 +178,7 @@ def test_a_degradation_of_pictures_changes_them_and_more_so_the_harder_it_is(nam
 
 @pytest.mark.usefixtures("noiseless")
 @pytest.mark.parametrize("name", ["motion_blur", "ball_size", "defocus"])
-def test_what_blurs_makes_pictures_less_sharp(name, rng):
+def test_blurs_make_pictures_less_sharp(name, rng):
     """Steps between neighbours in the middle of the disks, rms, grey levels."""
     texture, R = random_texture("blobs", 2, 128), so3.random_rotations(48, generator=rng).float()
     plain, mild, hard = (
@@ -192,7 +192,7 @@ def test_what_blurs_makes_pictures_less_sharp(name, rng):
 
 @pytest.mark.slow
 def test_a_blur_by_motion_is_about_the_attitude_in_the_middle_of_the_exposure():
-    """A dot is smeared on both sides of where it is."""
+    """A dot is smeared on both sides."""
     dot = dotted(torch.tensor([0.0, 0, -1]))
     film = film_disks(dot, torch.eye(3).expand(80, 3, 3), {"motion_blur": 8.0}, seeded(), EXACT)
     places = np.stack([dark_place(disk) for disk in film])
@@ -216,7 +216,7 @@ def test_a_wrong_radius_shrinks_the_ball():
     assert_close(torch.from_numpy(dark_place(film[0])), torch.tensor([0.6 * 39 / 45, 0.0]).double(), atol=0.03)
 
 
-def test_degradations_of_maps_are_left_to_who_holds_the_map(rng):
+def test_degradations_of_maps_change_no_disk(rng):
     texture, R = random_texture("blobs", 2, 64), so3.random_rotations(2, generator=rng).float()
     plain = film_disks(texture, R, {}, seeded(), EXACT)
     assert torch.equal(film_disks(texture, R, {"paint_wear": 0.4, "texture_error": 0.4}, seeded(), EXACT), plain)

@@ -27,7 +27,7 @@ def flatness(x: np.ndarray) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("omega", "alpha"), [(4.0, 7.6), (3.5, 5.0), (3.0, 3.0)])
-def test_a_law_has_the_moments_that_were_asked_for(omega, alpha):
+def test_a_law_has_its_given_moments(omega, alpha):
     rate, slope = sample(Law.of(7.8, 560.0, omega, alpha))
     assert rate.std() == pytest.approx(7.8, rel=0.01)
     assert slope.std() == pytest.approx(560, rel=0.01)
@@ -56,7 +56,7 @@ def test_true_moments_are_the_nominal_ones_in_both_frames(frame):
 
 
 @pytest.mark.parametrize("frame", ["lab", "body"])
-def test_orientations_turn_as_omega_says(frame):
+def test_orientations_rotate_by_omega(frame):
     true = draw_ensemble(EnsembleSpec(segments=5, mean_frames=80, frame=frame, frame_rate_hz=6000.0), 5)
     omega, _ = omega_from_orientations(
         torch.from_numpy(true.orientation), 1 / 6000, (1,), segment=torch.from_numpy(true.segment)
@@ -67,7 +67,7 @@ def test_orientations_turn_as_omega_says(frame):
     np.testing.assert_allclose(np.einsum("nij,nj->ni", true.orientation, true.alpha_body), true.alpha_lab, atol=1e-6)
 
 
-def test_positions_move_as_the_velocity_says():
+def test_positions_move_by_the_velocity():
     true = draw_ensemble(EnsembleSpec(segments=3), 6)
     one = true.segment == 1
     moved = np.gradient(true.position[one], 1 / 600, axis=0)[1:-1] * 1e-3
@@ -118,7 +118,7 @@ def test_the_smoother_recovers_a_quiet_ensemble_and_warns_of_a_loud_one():
         assert not found.noisy
     found = moments(loud, "alpha_lab", FEW)
     assert found.noisy
-    # what the smoother could not follow is missing from the rms; put back it comes nearer, and never taken off twice
+    # the rms lacks motion that the smoother removed; added again, it is nearer, and never subtracted twice
     off, corrected_off = (
         abs(x.value[:3] / clean.values["alpha_lab"].std(0) - 1) for x in (found.rms, found.corrected_rms)
     )
@@ -126,7 +126,7 @@ def test_the_smoother_recovers_a_quiet_ensemble_and_warns_of_a_loud_one():
 
 
 @pytest.mark.slow
-def test_components_in_the_other_frame_are_isotropic_whatever_the_laws():
+def test_components_in_the_other_frame_are_isotropic_for_any_laws():
     spec = replace(EnsembleSpec(), omega_rms=(2.0, 8.0, 14.0))
     law = nominal(spec)["omega_body"]
     np.testing.assert_allclose(law.rms, math.sqrt((4 + 64 + 196) / 3))

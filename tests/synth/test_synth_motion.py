@@ -46,7 +46,7 @@ def test_acceleration_is_the_derivative_of_velocity(around):
     assert now.acceleration_m_s2.abs().max() > 1
 
 
-def test_omega_is_what_turns_R_in_lab_components(around):
+def test_omega_rotates_R_in_lab_components(around):
     before, now, after = around
     turn_lab = so3.log(after.R_lab_body @ before.R_lab_body.mT) / (2 * STEP_S)
     assert_close(turn_lab, now.omega_lab_rad_s, atol=2e-3)
@@ -71,7 +71,7 @@ def test_orientations_are_rotations_and_begin_at_the_start():
     assert_close(now.R_lab_body[0], motion().R_start)
 
 
-def test_asked_at_other_instants_it_is_the_same_motion():
+def test_at_other_instants_it_is_the_same_motion():
     time_s = torch.arange(200, dtype=torch.float64) / 600
     every, third = motion().at(time_s), motion().at(time_s[::3])
     assert_close(third.R_lab_body, every.R_lab_body[::3], atol=1e-7)
@@ -98,7 +98,7 @@ def test_the_same_seed_is_the_same_motion_and_another_another():
 
 
 @pytest.mark.slow
-def test_rms_values_are_as_asked_where_the_volume_is_large():
+def test_rms_values_are_those_of_the_settings_where_the_volume_is_large():
     time_s = torch.arange(4000, dtype=torch.float64) / 100  # hundreds of correlation times
     now = motion(volume_mm=1e6).at(time_s)
     assert_close(now.velocity_m_s.square().mean(0).sqrt(), torch.full((3,), 0.3, dtype=torch.float64), atol=0.03)

@@ -53,8 +53,8 @@ def test_the_outline_of_a_clean_picture_is_that_of_the_spheres_points(name):  # 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LENSES)
 def test_the_limb_is_as_wide_as_a_fine_sample(name):
-    # What the soft limb is for: four rays a pixel are right to a hundredth of the step. A limb as wide as directions
-    # alone say, which forgets that rays begin at the wall, misses by two hundredths.
+    # With the soft limb four rays a pixel are right to a hundredth of the step. A limb as wide as directions
+    # alone give, without the rays' begin at the wall, misses by two hundredths.
     assert float((clean(name, WHITE_MAP) - clean(name, WHITE_MAP, supersampling=24)).abs().max()) < 0.01
 
 

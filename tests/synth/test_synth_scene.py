@@ -120,9 +120,9 @@ def test_noise_has_its_standard_deviation_and_its_seed():
     assert np.array_equal(dark[0], dark[1])
     assert not np.array_equal(dark[0], dark[2])
     assert dark[0].std() == pytest.approx(np.hypot(3.0, 12**-0.5), rel=0.03)  # and rounding
-    shot = picture(scene(background=100.0, shot_noise=0.4), place).astype(float)
-    assert shot.std() == pytest.approx(np.hypot(4.0, 12**-0.5), rel=0.03)
-    assert shot.mean() == pytest.approx(100.0, abs=0.2)
+    noisy = picture(scene(background=100.0, shot_noise=0.4), place).astype(float)
+    assert noisy.std() == pytest.approx(np.hypot(4.0, 12**-0.5), rel=0.03)
+    assert noisy.mean() == pytest.approx(100.0, abs=0.2)
 
 
 def test_a_scene_holds_the_map_at_the_pictures_resolution():

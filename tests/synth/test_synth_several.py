@@ -1,4 +1,4 @@
-"""Several balls in one movie: who is who in the files, no two overlap, nearer ones hide farther ones, one stays one."""
+"""Several balls in one movie: names in the files, no two overlap, nearer ones hide farther ones, one ball as before."""
 
 from pathlib import Path
 
@@ -93,18 +93,18 @@ def test_balls_without_room_are_refused_in_one_line():
 
 
 @pytest.mark.parametrize("name", ["uneven_light", "highlights", "occlusion", "bubbles"])
-def test_what_lies_on_the_disk_of_one_ball_is_refused_of_several(name, tmp_path):
+def test_degradations_on_the_disk_of_one_ball_are_refused_of_several(name, tmp_path):
     with pytest.raises(SettingsError, match=f"{name}: .* one ball, got 4"):
         write_synthetic_experiment(tmp_path / "new", SMALL, values={name: 2.0 if name == "uneven_light" else 0.5})
     assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.slow
-def test_degradations_of_the_picture_and_of_what_is_told_take_several_balls(written, tmp_path):
+def test_degradations_of_the_picture_and_of_input_files_take_several_balls(written, tmp_path):
     values = {"background_clutter": 20.0, "defocus": 1.0, "radius_error": 1.2, "texture_error": 0.1, "paint_wear": 0.2}
     path = write_synthetic_experiment(tmp_path, SMALL, values=values)
-    told = load_experiment(path)
-    assert [sphere.diameter_mm for sphere in told.spheres] == pytest.approx([12.0 * 1.1] * 4)
+    given = load_experiment(path)
+    assert [sphere.diameter_mm for sphere in given.spheres] == pytest.approx([12.0 * 1.1] * 4)
     wrong = [
         (load_texture(tmp_path / f"texture_{k}.png") - load_texture(written.parent / f"texture_{k}.png")).abs() > 0.5
         for k in range(3)
@@ -117,7 +117,7 @@ def white(diameter_mm: float = 18.0) -> object:
     return scene(WHITE_MAP, diameter_mm=diameter_mm, white=200.0, black=0.0)
 
 
-def test_a_nearer_ball_covers_those_behind_it_whatever_their_order():
+def test_a_nearer_ball_covers_those_behind_it_in_any_order():
     lens = camera()
     dark, bright = scene(torch.zeros(8, 16), black=50.0), white()
     near, far = seen_at(lens, 0.0, 0.0, 380.0), seen_at(lens, 0.5, 0.0, 420.0)

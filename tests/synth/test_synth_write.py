@@ -1,4 +1,4 @@
-"""A whole experiment on disk: what was written is what is read, and it is true."""
+"""A whole experiment on disk is read back and agrees with its truth."""
 
 import math
 from pathlib import Path

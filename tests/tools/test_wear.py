@@ -1,4 +1,4 @@
-"""Wear planted in the maps of a series is found, grows as it was planted, and keeps its place from map to map."""
+"""Wear planted in a series of maps is found, grows as planted, and keeps its position from map to map."""
 
 import json
 import math
@@ -48,7 +48,7 @@ def near(spot: tuple[float, float], radius_deg: float) -> Tensor:
 
 
 def planted(k: int) -> Tensor:
-    """Where the k-th map is worn."""
+    """Worn cells of the k-th map."""
     first, later = RADII_DEG[k]
     return (near(FIRST_SPOT, first) & (first > 0)) | (near(LATER_SPOT, later) & (later > 0))
 
@@ -72,7 +72,7 @@ def found() -> WearSeries:
 def test_worn_places_are_found_where_they_were_planted_in_the_first_maps_frame():
     for k, wear in enumerate(found().wear, start=1):
         first, later = RADII_DEG[k]
-        # Within a degree of the rim it could be displaced paint; half a degree is what the maps may be displaced.
+        # Within a degree of the rim it could be displaced paint; the maps may be displaced by half a degree.
         inside = near(FIRST_SPOT, first - 2.5) | (near(LATER_SPOT, later - 2.5) & (later > 0))
         outside = ~near(FIRST_SPOT, first + 2.5) & ~(near(LATER_SPOT, later + 2.5) & (later > 0))
         assert wear.worn[inside].double().mean() > 0.99
@@ -120,7 +120,7 @@ def test_maps_of_an_unworn_ball_show_no_wear_however_noisy():
 
 
 @pytest.mark.slow
-def test_what_a_map_does_not_know_is_neither_worn_nor_healed():
+def test_unseen_paint_is_neither_worn_nor_healed():
     blind = torch.where(near(FIRST_SPOT, 25.0), torch.nan, paint())
     worn = torch.where(planted(3), 0.7, paint())
     series = wear_series([paint(), worn, blind, worn], turned=False)
@@ -130,7 +130,7 @@ def test_what_a_map_does_not_know_is_neither_worn_nor_healed():
     assert not series.wear[1].worn.any()
     growth = series.growth
     assert growth[1].known == pytest.approx(1 - 0.5 * (1 - math.cos(math.radians(25))), abs=0.005)
-    assert growth[2].stays != growth[2].stays, "nothing was worn in the map before, as far as that one knows"
+    assert growth[2].stays != growth[2].stays, "no cell was worn in the map before, where it shows paint"
 
 
 def test_places_are_one_across_the_maps_edge_and_over_its_poles():
@@ -149,24 +149,24 @@ def test_places_are_one_across_the_maps_edge_and_over_its_poles():
 
 
 @pytest.mark.slow
-def test_the_command_tells_and_draws_a_series(tmp_path, monkeypatch, capsys):
+def test_the_command_prints_and_draws_a_series(tmp_path, monkeypatch, capsys):
     paths = [save_map(learnt(k), tmp_path / f"movie{k}.png") for k in range(3)]
     write_seen((~near(FIRST_SPOT, 0.0)).long() * 20, tmp_path / "movie0.png")
-    code, said, err = run(monkeypatch, capsys, "compare-maps", "--series", *paths, "--out", tmp_path / "wear.png")
+    code, output, err = run(monkeypatch, capsys, "compare-maps", "--series", *paths, "--out", tmp_path / "wear.png")
     assert code == 0, err
-    assert "place 1 at longitude 20°, latitude 15°" in said
-    assert "place 2 at longitude -120°, latitude -25°" in said
+    assert "place 1 at longitude 20°, latitude 15°" in output
+    assert "place 2 at longitude -120°, latitude -25°" in output
     assert cv2.imread(str(tmp_path / "wear.png")).shape[1] > 500
-    code, said, err = run(monkeypatch, capsys, "compare-maps", "--series", *paths[:2], "--json")
+    code, output, err = run(monkeypatch, capsys, "compare-maps", "--series", *paths[:2], "--json")
     assert code == 0, err
-    told = json.loads(said)
-    assert [row["map"] for row in told["maps"]] == [str(paths[1])]
-    assert told["maps"][0]["stays_share"] is None
-    assert [row["worn_share"] for row in told["maps"]] == pytest.approx(
+    printed = json.loads(output)
+    assert [row["map"] for row in printed["maps"]] == [str(paths[1])]
+    assert printed["maps"][0]["stays_share"] is None
+    assert [row["worn_share"] for row in printed["maps"]] == pytest.approx(
         [one.worn for one in found().growth[:1]], rel=0.05
     )
-    assert all(row["moved_rms_deg"] < 0.4 for row in told["maps"])
-    assert len(told["places"]) == 1
+    assert all(row["moved_rms_deg"] < 0.4 for row in printed["maps"])
+    assert len(printed["places"]) == 1
 
 
 def test_maps_that_make_no_pair_and_no_series_are_refused_in_one_line(tmp_path, monkeypatch, capsys):

@@ -23,7 +23,7 @@ def same(one: Trajectory, other: Trajectory) -> None:
     assert (one.provenance, one.settings, one.frame_rate) == (other.provenance, other.settings, other.frame_rate)
 
 
-def test_what_is_written_of_each_ball_is_read_in_the_same_order(tmp_path: Path) -> None:
+def test_balls_are_read_in_the_order_in_which_they_were_written(tmp_path: Path) -> None:
     several().save(tmp_path / "track.h5")
     read = Tracks.load(tmp_path / "track.h5")
     assert list(read) == ["b", "a", "c"]
@@ -46,7 +46,7 @@ def test_the_group_of_a_ball_is_a_file_of_one_ball(tmp_path: Path) -> None:
     same(Trajectory.load(tmp_path / "saved.h5"), several()["b"])
 
 
-def test_of_one_ball_without_name_the_file_is_that_of_a_trajectory(tmp_path: Path) -> None:
+def test_the_file_of_one_ball_without_name_is_that_of_a_trajectory(tmp_path: Path) -> None:
     full_trajectory().save(tmp_path / "track.h5")
     Tracks({"": full_trajectory()}).save(tmp_path / "tracks.h5")
     assert (tmp_path / "track.h5").read_bytes() == (tmp_path / "tracks.h5").read_bytes()
@@ -61,7 +61,7 @@ def test_tracks_of_other_times_are_refused() -> None:
         Tracks({"a": full_trajectory(), "b": full_trajectory()[2:5]})
 
 
-def test_one_of_several_is_picked_by_name() -> None:
+def test_one_ball_of_several_is_picked_by_name() -> None:
     assert list(several().picked("a")) == ["a"]
     assert several().picked(None).keys() == several().keys()
     with pytest.raises(TrackError, match="b, a, c, got 'd'"):

@@ -15,7 +15,7 @@ from sphereorient.errors import OutputError, ShapeError, TrackError
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
 
 FRAMES = 7
-# docs/data-format.md, written out once more so that the code's own table cannot vouch for itself
+# docs/data-format.md, written out once more so that the code's own table is not its own oracle
 FORMAT_SHAPES: dict[str, tuple[int, ...]] = {"time": (), "valid": (), "segment": (), "flags": (), "confidence": ()}
 FORMAT_SHAPES |= dict.fromkeys(("position", "position_smooth"), (3,))
 FORMAT_SHAPES |= dict.fromkeys(("position_cov", "position_smooth_cov", "orientation", "orientation_cov"), (3, 3))
@@ -84,7 +84,7 @@ def test_an_empty_trajectory_has_every_dataset_of_the_design_in_its_shape(tmp_pa
     assert found["valid"].dtype == bool
 
 
-def test_what_was_not_measured_is_nan_and_outside_any_segment() -> None:
+def test_unmeasured_frames_are_nan_and_outside_any_segment() -> None:
     track = Trajectory.empty(np.arange(FRAMES) / 600.0, cameras=("cam1",))
     for name, values in arrays(track).items():
         if name not in ("time", "valid", "segment", "flags"):
@@ -94,7 +94,7 @@ def test_what_was_not_measured_is_nan_and_outside_any_segment() -> None:
     assert set(track.cameras["cam1"].reason) == {"not_found"}
 
 
-def test_every_dataset_says_its_units_and_what_it_is(tmp_path: Path) -> None:
+def test_every_dataset_has_its_units_and_a_description(tmp_path: Path) -> None:
     full_trajectory().save(tmp_path / "track.h5")
     with h5py.File(tmp_path / "track.h5") as file:
         silent: list[str] = []
@@ -152,7 +152,7 @@ def test_a_reason_of_a_later_version_is_kept(tmp_path: Path) -> None:
     assert Trajectory.load(tmp_path / "track.h5").cameras["cam1"].reason == camera.reason
 
 
-def test_what_is_no_track_is_refused_by_name(tmp_path: Path) -> None:
+def test_a_file_that_is_no_track_is_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "text.h5").write_text("hello")
     for name, got in (("absent", "no file"), ("text", "something else")):
         with pytest.raises(TrackError, match=rf"{name}\.h5.*{got}"):
@@ -174,7 +174,7 @@ DAMAGE: dict[str, Callable[[h5py.File], object]] = {
 
 
 @pytest.mark.parametrize("words", DAMAGE)
-def test_what_is_damaged_is_named(tmp_path: Path, words: str) -> None:
+def test_the_damaged_dataset_is_named(tmp_path: Path, words: str) -> None:
     full_trajectory().save(tmp_path / "track.h5")
     with h5py.File(tmp_path / "track.h5", "a") as file:
         DAMAGE[words](file)

@@ -1,4 +1,4 @@
-"""The Cramér-Rao bound: what can be worked out by hand, its laws, and the scatter of an estimator that reaches it."""
+"""The Cramér-Rao bound: values by hand, its laws, and the scatter of an estimator that reaches it."""
 
 import math
 
@@ -32,7 +32,7 @@ def attitudes() -> torch.Tensor:
 
 
 def face() -> torch.Tensor:
-    """R_view_body that turns body +x, the middle of the map, to the camera, north up."""
+    """R_view_body that rotates body +x, the middle of the map, to the camera, north up."""
     return torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]], dtype=torch.float64)
 
 
@@ -48,8 +48,8 @@ def test_a_white_ball_has_the_information_of_its_outline():  # oracle
 
 
 def test_one_straight_border_across_the_disk_has_the_information_worked_out_by_hand():  # oracle
-    # East white, west black: seen is one line through the middle, upright but for half a radian that keeps it off the
-    # rows of pixels. Turned by d about the view's z, its point at distance s from the middle moves by s d, and the
+    # East white, west black: the disk shows one line through the middle, tilted by half a radian to keep it off the
+    # rows of pixels. Rotated by d about the view's z, its point at distance s from the middle moves by s d, and the
     # squares add up to 2 r^3 / 3; about the line itself by sqrt(r^2 - s^2) d: 4 r^3 / 3.
     radius = 30.0
     east = (map_directions(512)[..., 1] > 0).float()
@@ -64,7 +64,7 @@ def test_rotations_about_view_x_move_a_horizontal_border():  # convention
     north = (map_directions(512)[..., 2] > 0).float()
     found = cramer_rao_bound(north, face(), diameter_px=60, sampling=GREY[0.5]).information.diagonal()
     assert float(found[0]) > 50 * float(found[1])  # a horizontal line rolls up and down about x, and not about y
-    assert float(found[4]) > 1.5 * float(found[3])  # v sees the line and the outline, u the outline alone
+    assert float(found[4]) > 1.5 * float(found[3])  # v depends on line and outline, u on the outline alone
 
 
 @pytest.mark.slow
@@ -192,7 +192,7 @@ def test_covariance_is_the_inverse_of_information_in_any_units():
     assert_close(covariance @ information, torch.eye(6, dtype=torch.float64), atol=1e-9)
 
 
-def test_what_is_no_picture_is_refused(patches):
+def test_impossible_arguments_are_refused(patches):
     with pytest.raises(SettingsError, match="noise_share"):
         cramer_rao_bound(patches, face(), diameter_px=24, noise_share=0.0)
     with pytest.raises(ShapeError, match="R_view_body"):

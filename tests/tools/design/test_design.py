@@ -1,4 +1,4 @@
-"""Paint before it is on the ball: how coarse it is, what its views can say, and strips of true size."""
+"""Paint before it is on the ball: its coarseness, the information of its views, and strips of true size."""
 
 import json
 import math
@@ -33,7 +33,7 @@ FEW = DesignSettings(diameter_px=24, views=12)
 
 
 def bands(width_deg: float, height: int = 360) -> torch.Tensor:
-    """Rings about the axis, as wide as said, painted in turn from the equator on."""
+    """Rings about the axis, of given width, painted in turn from the equator on."""
     latitude = torch.rad2deg(torch.asin(map_directions(height)[..., 2]))
     return ((latitude / width_deg).floor() % 2).float()
 
@@ -58,7 +58,7 @@ def test_a_direction_faces_the_camera_with_north_up_and_east_right():  # convent
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [12.0, 20.0])
 def test_rings_take_a_brush_of_their_width(width):  # oracle
-    # A brush as wide as a ring just fits; the lattice of points knows widths to a degree or two.
+    # A brush as wide as a ring just fits; the lattice of points gives widths to a degree or two.
     assert stroke_deg(bands(width)) == pytest.approx(width, abs=2.0)
 
 
@@ -95,7 +95,7 @@ def test_paint_of_twice_the_size_has_half_the_border_and_takes_twice_the_brush(k
 @pytest.mark.parametrize(
     ("kind", "size", "got"), [("stripes", 10.0, "'stripes'"), ("dots", 0.1, "0.1"), ("dots", math.nan, "nan")]
 )
-def test_paint_that_nobody_knows_is_refused(kind, size, got):
+def test_an_unknown_kind_or_size_of_paint_is_refused(kind, size, got):
     with pytest.raises(PaintError, match=got):
         patterned_texture(kind, size, 0)
 
@@ -122,8 +122,8 @@ def test_views_that_are_near_each_other_are_not_counted_as_alike():
 
 
 @pytest.mark.slow
-def test_the_judgement_is_that_of_the_bound_and_knows_the_view_without_paint():
-    # Dots on one half only: the other half's middle is white, and nothing can be said there.
+def test_the_judgement_is_that_of_the_bound_and_finds_the_view_without_paint():
+    # Dots on one half only: the other half's middle is white, without information.
     direction = map_directions(128)
     texture = patterned_texture("dots", 15.0, 1, 128)
     texture = torch.where(direction[..., 0] > 0, texture, torch.ones_like(texture))
@@ -246,7 +246,7 @@ def test_the_command_judges_makes_and_prints(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "expected"),
     [
         ([], "neither"),
         (["map.png", "--make"], "got both"),
@@ -255,15 +255,15 @@ def test_the_command_judges_makes_and_prints(tmp_path):
         (["--make", "--kinds", "stripes"], "'stripes'"),
     ],
 )
-def test_bad_input_gets_one_line(arguments, says, tmp_path, monkeypatch, capsys):
+def test_bad_input_gets_one_line(arguments, expected, tmp_path, monkeypatch, capsys):
     command = ["sphereorient", "texture", "design", *arguments, "--out", str(tmp_path / "out"), "--quiet"]
     monkeypatch.setattr(sys, "argv", command)
     with pytest.raises(SystemExit) as stopped:
         cli.main()
     assert stopped.value.code == 2
-    told = capsys.readouterr().err
-    assert says in told
-    assert told.count("\n") == 1
+    message = capsys.readouterr().err
+    assert expected in message
+    assert message.count("\n") == 1
 
 
 @pytest.mark.slow  # judges 18 maps

@@ -1,4 +1,4 @@
-"""Photographs of a ball with dots, drawn from the definitions: none of the package's renderers is asked."""
+"""Photographs of a ball with dots, drawn from the definitions, without the package's renderers."""
 
 import numpy as np
 import torch

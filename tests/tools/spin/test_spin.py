@@ -1,4 +1,4 @@
-"""Even spins: planted ones come back, also above half a turn per picture; aliases are told; handedness is certain."""
+"""Even spins: planted ones come back, also above half a turn per picture; aliases are given; handedness is certain."""
 
 import csv
 import math
@@ -25,7 +25,7 @@ QUICK = GreySearchSettings(size_px=32, score_min=0.05, peaks=12, finalists=8)
 
 
 def candidates(omega, time_s, *, wrong=2, scatter_deg=3.0, missing=(), seed=3):
-    """Candidates of pictures: the right one among `wrong` ones of the same belief; of `missing` ones none is right."""
+    """Candidates of pictures: the right one among `wrong` ones of equal score; `missing` ones have no right one."""
     rng = torch.Generator().manual_seed(seed)
     count = len(time_s)
     true = spinning(omega, so3.random_rotations((), generator=rng), time_s)
@@ -59,7 +59,7 @@ def test_a_planted_spin_comes_back_among_wrong_candidates_and_wrong_pictures(tur
 
 
 @pytest.mark.slow
-def test_beyond_half_a_turn_per_picture_all_aliases_are_told_with_the_same_evidence():
+def test_beyond_half_a_turn_per_picture_all_aliases_are_given_with_the_same_evidence():
     axis = torch.nn.functional.normalize(torch.tensor([0.5, -0.3, 0.8], dtype=torch.float64), dim=0)
     omega = 0.8 * TURN * axis  # looks like 0.2 turns backwards
     time_s = STEP * torch.arange(12, dtype=torch.float64)
@@ -100,9 +100,9 @@ def test_the_sigma_of_the_rate_is_the_scatter_over_many_draws():
     time_s = STEP * torch.arange(10, dtype=torch.float64)
     found = [fit_spins(candidates(omega, time_s, scatter_deg=5.0, wrong=0, seed=s)[0], 0.5 * TURN) for s in range(24)]
     rates = torch.stack([spins.omega_view_rad_s[0].norm() for spins in found])
-    told = torch.stack([spins.rate_sigma()[0] for spins in found]).square().mean().sqrt()
-    # 24 draws know their scatter to 15 %; the sigma itself is from 10 pictures.
-    assert float(rates.std() / told) == pytest.approx(1.0, abs=0.4)
+    stated = torch.stack([spins.rate_sigma()[0] for spins in found]).square().mean().sqrt()
+    # 24 draws give their scatter to 15 %; the sigma itself is from 10 pictures.
+    assert float(rates.std() / stated) == pytest.approx(1.0, abs=0.4)
 
 
 def filmed(omega, time_s, *, strays=(), mirror=False):
@@ -123,7 +123,7 @@ def test_photographs_give_back_spin_attitudes_and_aliases_with_strays_between():
     photographs, R, table = filmed(omega, time_s, strays=(3, 8))
     found = spin_of(photographs, table, SpinSettings(omega_max_rad_s=TURN, search=QUICK))
     rates = [float(one @ axis) / TURN for one in found.spins.omega_view_rad_s]
-    assert rates == pytest.approx([-0.35, 0.65], abs=0.005)  # the slower one leads, the other is told
+    assert rates == pytest.approx([-0.35, 0.65], abs=0.005)  # the slower one leads, the other is given
     assert found.ambiguous == 2
     right = [k for k in range(12) if k not in (3, 8)]
     assert float(torch.rad2deg(so3.geodesic_distance(found.R_view_body, R))[right].max()) < 4

@@ -64,7 +64,7 @@ def test_dots_that_are_not_there_are_refused():
         (torch.eye(3), math.nan, "nan"),
     ],
 )
-def test_what_is_no_table_of_dots_is_refused_in_one_line(table, radius, got):
+def test_a_file_that_is_no_table_of_dots_is_refused_in_one_line(table, radius, got):
     with pytest.raises(PaintError, match=got) as caught:
         DotTable(direction_body=table, radius_deg=radius)
     assert "\n" not in str(caught.value)
