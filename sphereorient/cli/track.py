@@ -12,7 +12,7 @@ from typer import Argument, Option
 
 from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
 from sphereorient.cli.options import CameraOptions, ExperimentPath, FicTracConfigPath, NoCache, Resume, ball_words
-from sphereorient.errors import OutputError, PaintError, SettingsError, refusal
+from sphereorient.errors import OutputError, PaintError, SettingsError, SphereOrientError, refusal
 from sphereorient.files.whole_file import check_ending
 
 if TYPE_CHECKING:
@@ -87,7 +87,10 @@ def _with_map(path: Path, given: _TrackOptions, settings: "Settings") -> "Path |
     """Return an experiment with a map; for a single ball without one, learn and write it."""
     from sphereorient.experiment import load_experiment
 
-    experiment = load_experiment(path)
+    try:
+        experiment = load_experiment(path)
+    except SphereOrientError:  # its run reports it: the other experiments go on
+        return path
     if given.method != "precise" or given.learnt is not None or not experiment.mapless:
         return path
     from sphereorient.files.whole_file import writing

@@ -161,7 +161,7 @@ def test_the_command_marks_doubtful_cameras_and_writes_no_hopeless_ones(tmp_path
         return
     assert not stop.value.code
     assert "doubtful: cam1: residuals of neighbouring points agree" in printed
-    assert out.read_text().splitlines()[1].startswith("# doubtful: cam1: neighbouring")
+    assert out.read_text().splitlines()[1].startswith("# doubtful: cam1: residuals")
     assert list(load_cameras(out)) == ["cam1"]
 
 

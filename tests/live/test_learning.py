@@ -58,7 +58,7 @@ def test_an_adjustment_takes_drift_away_and_the_body_frame_goes_on(ball):
 def test_the_map_of_the_frames_so_far_shows_the_paint(ball):
     tracker = LearningTracker(ball.place)
     followed(tracker, ball, range(3))
-    with pytest.raises(PaintError, match="turns"):
+    with pytest.raises(PaintError, match="rotates"):
         tracker.texture()
     followed(tracker, ball, range(3, 40))
     found = tracker.texture()

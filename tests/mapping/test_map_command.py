@@ -136,7 +136,7 @@ def test_a_ball_that_does_not_turn_is_refused(copy, tmp_path, monkeypatch, capsy
         np.save(copy.parent / f"{name}.npy", still)
     rewrite(copy, movies={"cam1": "cam1.npy", "cam2": "cam2.npy"})
     line = refused(monkeypatch, capsys, "map", copy, "--out", tmp_path / "map.png")
-    assert "turns" in line
+    assert "rotates" in line
 
 
 def test_bad_arguments_are_refused_before_any_work(copy, tmp_path, monkeypatch, capsys):

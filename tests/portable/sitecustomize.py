@@ -5,6 +5,8 @@ import os
 import sys
 import warnings
 
+import psutil  # noqa: F401  its modules for Windows need none of them
+
 for name in ("fcntl", "grp", "pwd", "resource", "termios", "tty", "pty", "syslog"):
     sys.modules[name] = None
 for name in ("fork", "forkpty", "mkfifo", "geteuid", "getegid", "sched_getaffinity"):
