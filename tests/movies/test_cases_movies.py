@@ -84,7 +84,8 @@ def test_the_rotation_tag_is_remarked_upon():
         assert remarks(open_movie(CASES / "rotation_tag" / name), f"{turn} degrees clockwise")
 
 
-@pytest.mark.parametrize("unit", ["ms", *(pytest.param(unit, marks=pytest.mark.slow) for unit in ("us", "ns"))])
+@pytest.mark.slow  # tests/experiment/test_time_units.py shows the units
+@pytest.mark.parametrize("unit", ["ms", "us", "ns"])
 def test_units_that_no_file_states_are_refused(tmp_path, monkeypatch, capsys, unit):
     for name in (f"{unit}.h5", "texture.png"):
         (tmp_path / name).symlink_to(CASES / "time_units" / name)

@@ -114,6 +114,7 @@ def test_a_given_circle_stands_where_the_movie_shows_none(tmp_path):
         assert math.isclose(look.outline.radius_px, CIRCLE[2])
 
 
+@pytest.mark.slow  # the outlines above are doubtful too
 @pytest.mark.shared
 def test_the_ball_of_a_fly_stays_and_its_outline_is_doubtful():
     look = seen(SHARED / "real" / "fictrac" / "sample.mp4")
