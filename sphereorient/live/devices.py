@@ -344,7 +344,7 @@ def worded(name: str) -> Iterator[None]:
 
 
 def device_frames(cameras: Sequence[LiveCamera], log: Log, stopped: Event) -> Iterator[Arrival]:
-    """Yield the instants of cameras until `stopped` or a single camera ends. Raises as as `LiveCamera`, `Instants`."""
+    """Yield the instants of cameras until `stopped` or a single camera ends. Raises as `LiveCamera`, `Instants`."""
     instants, waiting = Instants([one.stream.name for one in cameras], log), set(range(len(cameras)))
     triggered = any(one.keys is not None and one.keys.trigger not in (None, "none") for one in cameras)
     pictures: Iterator[Came] = ((0, shot) for shot in cameras[0].pictures(stopped))
