@@ -241,6 +241,7 @@ def test_a_ball_far_away_does_not_give_the_field_of_view(ball):
     assert focal_ratio(kept(ball, place).adjusted()) == 1.0
 
 
+@pytest.mark.slow
 def test_a_flying_ball_gets_a_map():
     experiment = load_experiment(EXCERPT / "experiment.yaml")
     found, remarks = first_map_of(experiment.with_sphere(texture_path=None), Settings(), None, lambda *_: None)
