@@ -14,16 +14,18 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 from typer import Option
 from typer.core import TyperGroup
 
 from sphereorient import __version__
 from sphereorient.errors import SettingsError, SphereOrientError, error_words, refusal
 from sphereorient.files.whole_file import check_folder, check_target, write_text, writing
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 
 class InOrder(TyperGroup):
@@ -145,7 +147,14 @@ def echo_lines(lines: Iterable[str]) -> None:
         typer.echo(line)
 
 
-def print_table(table: Any) -> None:
+def new_table(*columns: Any, **options: Any) -> "Table":
+    """Return an empty table of rich, which is imported here: else each command would wait for it."""
+    from rich.table import Table
+
+    return Table(*columns, **options)
+
+
+def print_table(table: "Table") -> None:
     """Print a table of rich; without a terminal, at least 140 characters wide."""
     from rich.console import Console
 
@@ -271,7 +280,7 @@ def _print_findings(found: dict[str, Any]) -> None:
         for words in lines or ["none"]:
             typer.echo(f"{name.replace('_', ' '):24} {words}")
     if fits:
-        table = Table(*fits[0], title="live, one camera: time per frame, and the rates that it can hold")
+        table = new_table(*fits[0], title="live, one camera: time per frame, and the rates that it can hold")
         for fit in fits:
             table.add_row(*(f"{number:.3g}" for number in fit.values()))
         print_table(table)

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 from typer import Argument, Option
 
-from sphereorient.cli.app import Commands, app, check_writable, echo_lines, print_table, progress_bar
+from sphereorient.cli.app import Commands, app, check_writable, echo_lines, new_table, print_table, progress_bar
 from sphereorient.cli.options import (
     Align,
     Cameras,
@@ -32,6 +31,8 @@ from sphereorient.files.threads import counted
 from sphereorient.files.whole_file import write_text, writing
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from sphereorient.bench import BenchSettings, Results, Score
     from sphereorient.bench.score import Floats
     from sphereorient.statistics import Interval
@@ -147,11 +148,11 @@ def print_errors(errors_deg: "Floats", ball: str, word: str = "error") -> None:
         typer.echo(f"{word}, degrees: {percentiles}; above {WRONG_DEG:g}: {100 * wrong:.3g} %")
 
 
-def behaviour_table(found: "Behaviour", ball: str = "", *, exact: bool) -> Table:
+def behaviour_table(found: "Behaviour", ball: str = "", *, exact: bool) -> "Table":
     """Return gain, drift, heading and path against a reference as a table."""
     of, against = f" of ball {ball}" if ball else "", "the exact truth" if exact else "another tracker"
     title = f"Behaviour{of} against {against}, {found.pairs} rotations between frames"
-    table = Table("quantity", "x", "y", "z", "along the rotation", title=title)
+    table = new_table("quantity", "x", "y", "z", "along the rotation", title=title)
 
     def gains(name: str, gain: "Interval") -> None:
         table.add_row(name, *(f"{value:.4f}" for value in gain.value))
@@ -174,11 +175,11 @@ def behaviour_table(found: "Behaviour", ball: str = "", *, exact: bool) -> Table
     return table
 
 
-def error_table(found: "Score", ball: str | None = None) -> Table:
+def error_table(found: "Score", ball: str | None = None) -> "Table":
     """Return errors of orientation and position, and relative errors of the rates, as a table."""
     of = f" of ball {ball}" if ball else ""
     title = f"Errors{of} against the exact truth, {found.valid.sum()} of {found.frames} frames valid"
-    table = Table("quantity", "median", "95 %", "largest", title=title)
+    table = new_table("quantity", "median", "95 %", "largest", title=title)
     p50, p95, _, largest = found.percentiles_deg()
     table.add_row("orientation (degrees)", f"{p50:.3f}", f"{p95:.3f}", f"{largest:.3f}")
     p50, p95, _, largest = found.percentiles_mm()
@@ -351,7 +352,7 @@ def _print_scenes(rows: Sequence[dict[str, Any]]) -> None:
     title = "No prior knowledge; degrees, 95 % in brackets; FicTrac, spintrack: as spintrack publishes them"
     columns = ("scene", "found", "first pass: step", "orientation", "refined: step", "orientation")
     more = ("gain, axes", "drift/min", "step / sigma", "CPU ms", "FicTrac", "spintrack")
-    table = Table(*columns, *more, title=title)
+    table = new_table(*columns, *more, title=title)
     table.columns[0].no_wrap = True
     for row in rows:
         first, refined = row["first"], row.get("refined")
@@ -416,7 +417,7 @@ def live_delay(given: _LiveDelayOptions) -> None:
     if len(found) == 1:
         echo_lines(found[0].summary())
         return
-    table = Table("Hz", *COLUMNS, title=f"From a picture in memory to its line, other busy programs: {given.load}")
+    table = new_table("Hz", *COLUMNS, title=f"From a picture in memory to its line, other busy programs: {given.load}")
     for rate_hz, one in zip(rates, found, strict=True):
         table.add_row(f"{rate_hz:g}", *one.row())
     print_table(table)
@@ -464,7 +465,7 @@ def write_scenes(given: _SceneOptions) -> None:
 def _print(found: "Results") -> None:
     from sphereorient.bench.results import summaries
 
-    table = Table(
+    table = new_table(
         "degradation", "level", "method", "median", "95 %", "wrong", "lost", "first", "inside", "over sigma", "frames/s"
     )
     for line in summaries(found):
@@ -485,7 +486,7 @@ def _print(found: "Results") -> None:
 def _print_balls(runs: "Sequence[Results]") -> None:
     from sphereorient.bench.results import summaries
 
-    table = Table(
+    table = new_table(
         *("cameras", "balls", "per litre", "hidden", "valid", "degrees, median", "95 %", "mm, median", "95 %"),
         *("given to another", "exchanges", "over sigma", "balls x frames/s"),
     )

@@ -8,10 +8,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 from typer import Argument, Option
 
-from sphereorient.cli.app import Commands, app, check_writable, command_line, echo_lines, print_table, progress_bar
+from sphereorient.cli.app import (
+    Commands,
+    app,
+    check_writable,
+    command_line,
+    echo_lines,
+    new_table,
+    print_table,
+    progress_bar,
+)
 from sphereorient.cli.options import Quiet, names_in
 from sphereorient.errors import TextureError, refusal
 from sphereorient.files.provenance import without_nan
@@ -215,7 +223,7 @@ def _written(out: Path, drawn: "Tensor", judgement: "Judgement", title: str, *, 
 
 def _print_judgement(judgement: "Judgement", title: str) -> None:
     measures = judgement.as_dict()
-    table = Table(title, "least", "middle", "most", title="judgement", title_justify="left")
+    table = new_table(title, "least", "middle", "most", title="judgement", title_justify="left")
     white, bound = measures["white_share"], measures["bound_deg"]
     table.add_row("white in a view, %", *(_number(white[name], 100, 0) for name in SPREAD))
     table.add_row("best possible error of a view, degrees", *(_number(bound[name], 1, 3) for name in SPREAD))

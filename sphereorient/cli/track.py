@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Column, Table
 from typer import Argument, Option
 
-from sphereorient.cli.app import app, check_writable, command_line, echo_lines, print_table, progress_bar
+from sphereorient.cli.app import app, check_writable, command_line, echo_lines, new_table, print_table, progress_bar
 from sphereorient.cli.options import CameraOptions, ExperimentPath, FicTracConfigPath, NoCache, Resume, ball_words
 from sphereorient.errors import OutputError, PaintError, SettingsError, SphereOrientError, refusal
 from sphereorient.files.whole_file import check_ending
@@ -149,7 +148,9 @@ def _track_side_by_side(
 
 
 def _print_table(outcomes: "Sequence[Outcome]") -> None:
-    table = Table("track", *(Column(heading, justify="right") for heading in ("frames", "valid", "s", "frames/s")), "")
+    table = new_table("track", "frames", "valid", "s", "frames/s", "")
+    for column in table.columns[1:5]:
+        column.justify = "right"
     for outcome in outcomes:
         rate = f"{outcome.frames / outcome.seconds:.1f}" if outcome.frames else ""
         counts = (str(outcome.frames), str(outcome.valid)) if outcome.error is None else ("", "")

@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 from typer import Argument, Option
 
-from sphereorient.cli.app import app, check_writable, print_table, progress_bar
+from sphereorient.cli.app import app, check_writable, new_table, print_table, progress_bar
 from sphereorient.cli.options import Quiet
 
 if TYPE_CHECKING:
@@ -83,7 +82,7 @@ def evaluate(
 
 def _print(found: "ProposerBenchmark") -> None:
     levels = sorted({one.level for one in found.families})
-    table = Table("degradation", *(f"level {level}\nfirst / five" for level in levels))
+    table = new_table("degradation", *(f"level {level}\nfirst / five" for level in levels))
     for family in dict.fromkeys(one.family for one in found.families):
         row = {one.level: one for one in found.families if one.family == family}
         cells = [f"{100 * row[level].recall_1:.1f} / {100 * row[level].recall_5:.1f} %" for level in levels]
