@@ -245,14 +245,14 @@ def steps(bench: Bench, lanes: int) -> tuple[float, float]:
 def steps_of(tracker: Tracker, frames: list[list[Frame]], times: list[float], lanes: int) -> tuple[float, float]:
     """Return CPU s of the first two frames of all blocks side by side, and of a predicted one (median)."""
     at: list[float] = []
-    real = tracker._step
+    real = tracker.step
 
     def step(*given: Any) -> Any:
         at.append(time.process_time())
         return real(*given)
 
     length = len(times) // lanes
-    with mock.patch.object(tracker, "_step", step):
+    with mock.patch.object(tracker, "step", step):
         list(tracker.track([movie[: lanes * length] for movie in frames], [length] * lanes, times))
     at.append(time.process_time())
     # First frames are searched for, second ones approached.

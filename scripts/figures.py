@@ -107,8 +107,9 @@ FIGURES: dict[str, Figure] = {
     "report": Figure(pages=("report.md", "walkthrough.md"), command="figure_report.py"),
     "live-faults": Figure(pages=("live.md",), command=f"live_faults.py {SHARED}/fixed_ball/experiment.yaml"),
     "live": Figure(
-        pages=("live.md", "fictrac.md"),
-        command=f"sphereorient bench live {SHARED}/fixed_ball/experiment.yaml --rate 200,500 --loop --seconds 15",
+        pages=("live.md",),
+        command=f"sphereorient bench live {SHARED}/experiment/experiment.yaml --cameras cam1"
+        " --rate 200,300,400,500 --load 1 --loop --seconds 30",
     ),
     "paper": Figure(pages=("paper.md",), command="reproduce_paper.py --out out/paper --docs"),
 }

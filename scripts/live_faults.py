@@ -1,15 +1,16 @@
 """Plant faults while `live` tracks: a black-out, a hand before the ball, a jump of 60 degrees, a lamp.
 
-    scripts/live_faults.py EXPERIMENT [--learnt learnt.h5] [--cameras cam1]
+    scripts/live_faults.py EXPERIMENT [--cameras cam1]
 
-The changed frames of the experiment arrive one by one; errors are against truth.h5 beside it. Prints Markdown, for each
-fault: frames without a pose or flagged, wrong frames without a flag, and the time from the arrival of the first good
-frame to its pose.
+Without a map, a first map is learnt before. The changed frames of the experiment arrive one by one; errors are
+against truth.h5 beside it. Prints Markdown, for each fault: frames without a pose or flagged, wrong frames without a
+flag, and the time from the arrival of the first good frame to its pose.
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -20,11 +21,15 @@ import numpy as np
 import torch
 
 from sphereorient import so3
+from sphereorient.experiment import Experiment, load_experiment
+from sphereorient.files.threads import silent
 from sphereorient.live.feed import Arrival
 from sphereorient.live.live import Measured, measured
 from sphereorient.live.loop import open_live
 from sphereorient.live.sources import movie_frames
+from sphereorient.methods.map import first_map_of
 from sphereorient.methods.settings import Settings
+from sphereorient.report.texture_map import write_map
 
 FIRST, LONG_S, JUMP_DEG = 60, 0.5, 60.0
 HAND_GREY, HAND_SHARE, LAMP = 128, 0.7, 0.6
@@ -34,15 +39,25 @@ WRONG_DEG = 1.0  # from truth, one rotation of the body frame removed
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("experiment", type=Path)
-    parser.add_argument("--learnt", type=Path)
     parser.add_argument("--cameras", nargs="+")
     arguments = parser.parse_args()
-    with h5py.File(arguments.experiment.parent / "truth.h5", "r") as file:
+    experiment = load_experiment(arguments.experiment)
+    with tempfile.TemporaryDirectory() as folder:
+        if experiment.mapless:
+            texture = Path(folder) / "texture.png"
+            write_map(first_map_of(experiment, Settings(), arguments.cameras, silent)[0], texture)
+            experiment = experiment.with_sphere(texture_path=texture)
+        show(experiment, arguments.cameras)
+
+
+def show(experiment: Experiment, cameras: Sequence[str] | None) -> None:
+    """Track the movie with each fault and print the table."""
+    with h5py.File(experiment.path.parent / "truth.h5", "r") as file:
         R_true = torch.from_numpy(file["orientation"][()])
     print("| fault | frames of it | of these flagged | wrong without a flag | back after | error before, after |")
     print("|---|---|---|---|---|---|")
     for name in ("black-out", "hand", "turn", "lamp"):
-        with open_live(arguments.experiment, Settings(), arguments.cameras, arguments.learnt) as opened:
+        with open_live(experiment, Settings(), cameras, None) as opened:
             frames = list(movie_frames(opened.recording, paced=False))
             views = opened.tracker.appearances[""].fitter.views
             middle = measured(opened.tracker, views, [replace(frames[0], time_s=-1.0)])
