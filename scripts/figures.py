@@ -6,12 +6,14 @@
 
 A command writes its page itself, or prints Markdown whose tables go between the page's marks
 `<!-- figure NAME -->` and `<!-- end NAME -->`; what it prints is kept in out/figures. Numbers within sentences are
-copied by hand from there. docs/figures.md holds date, commit and CPU time of each figure.
+copied by hand from there. docs/figures.md holds the CPU, and date, commit and CPU time of each figure.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import platform
 import re
 import resource
 import shlex
@@ -72,6 +74,7 @@ FIGURES: dict[str, Figure] = {
         command=f"stated_errors.py {SHARED} --only sets movies both stills",
         tables=("stated-sets", "stated-one", "stated-two", "stated-stills"),
     ),
+    "stills": Figure(pages=("robustness.md",), command="single_stills.py --stills 3"),
     "limits": Figure(pages=("robustness.md",), command="light_limits.py", tables=("limits",)),
     "density": Figure(pages=("robustness.md",), command="sphereorient bench balls --out out/balls"),
     "reliability": Figure(pages=("robustness.md",), command="reliability.py"),
@@ -82,6 +85,7 @@ FIGURES: dict[str, Figure] = {
     ),
     "plates": Figure(pages=("accuracy.md",), command=f"plate_pictures.py {SHARED}/experiment"),
     "bumped": Figure(pages=("accuracy.md",), command=f"self_calibration.py {SHARED}/experiment"),
+    "memory": Figure(pages=("accuracy.md",), command=f"bench_memory.py {SHARED}/experiment/experiment.yaml"),
     "departures": Figure(pages=("paper-map.md",), command=f"paper_departures.py {SHARED}/experiment"),
     "backgrounds": Figure(pages=("paper-map.md",), command=f"compare_backgrounds.py {SHARED}/experiment"),
     "search": Figure(pages=("accuracy.md",), command=f"bench_search.py {SHARED}/experiment"),
@@ -99,6 +103,7 @@ FIGURES: dict[str, Figure] = {
     "photographs-maps": Figure(pages=("map.md",), command="photographs.py --moves --counts 12 30 --sets 3"),
     "fly": Figure(pages=("map.md",), command="real_fictrac.py"),
     "fictrac-axes": Figure(pages=("fictrac.md",), command="fictrac_axes.py"),
+    "scenes": Figure(pages=("fictrac.md",), command="sphereorient bench ball --out out/ball"),
     "dots": Figure(pages=("photographs.md",), command="real_spindoe.py"),
     "moon": Figure(pages=("moon.md",), command=f"moon.py {SHARED}/real/moon", tables=("moon",)),
     "statistics": Figure(pages=("statistics.md",), command="ensemble_coverage.py"),
@@ -106,6 +111,7 @@ FIGURES: dict[str, Figure] = {
     "long-report": Figure(pages=("report.md",), command="bench_report.py out/long-report"),
     "report": Figure(pages=("report.md", "walkthrough.md"), command="figure_report.py"),
     "live-faults": Figure(pages=("live.md",), command=f"live_faults.py {SHARED}/fixed_ball/experiment.yaml"),
+    "closed-loop": Figure(pages=("live.md",), command="closed_loop.py"),
     "live": Figure(
         pages=("live.md",),
         command=f"sphereorient bench live {SHARED}/experiment/experiment.yaml --cameras cam1"
@@ -139,6 +145,15 @@ def rows() -> dict[str, Made]:
     return {name: Made(*cells) for name, *cells in found}
 
 
+def cpu_name() -> str:
+    """Return name, family and model of the CPU, and the number of cores."""
+    info = Path("/proc/cpuinfo")
+    found = dict(re.findall(r"^([\w ]+?)\s*: (.*)$", info.read_text() if info.is_file() else "", re.MULTILINE))
+    name = found.get("model name", platform.processor())
+    numbers = [f"{key} {found[key]}" for key in ("cpu family", "model", "stepping") if key in found]
+    return ", ".join([name, *numbers, f"{os.cpu_count()} cores"])
+
+
 def write_page(made: dict[str, Made]) -> None:
     """Write docs/figures.md."""
     now = {name: code_of(figure) for name, figure in FIGURES.items()}
@@ -149,7 +164,8 @@ def write_page(made: dict[str, Made]) -> None:
         "Written by `scripts/figures.py`, which makes the tables and figures of these pages anew; `--only NAME` one of",
         "them. `code` is a digest of the code that made a figure; if that has changed, the figure is *older*.",
         "",
-        f"**{len(FIGURES)} figures, {len(older)} of them older than the code that they measure.**",
+        f"**{len(FIGURES)} figures, {len(older)} of them older than the code that they measure.** CPU of the last one:",
+        f"{cpu_name()}.",
         "",
         HEAD,
         "|---" * 7 + "|",
