@@ -85,7 +85,9 @@ FIGURES: dict[str, Figure] = {
     ),
     "plates": Figure(pages=("accuracy.md",), command=f"plate_pictures.py {SHARED}/experiment"),
     "bumped": Figure(pages=("accuracy.md",), command=f"self_calibration.py {SHARED}/experiment"),
-    "memory": Figure(pages=("accuracy.md",), command=f"bench_memory.py {SHARED}/experiment/experiment.yaml"),
+    "memory": Figure(
+        pages=("accuracy.md",), command=f"bench_memory.py {SHARED}/experiment/experiment.yaml --times 1 5 10"
+    ),
     "departures": Figure(pages=("paper-map.md",), command=f"paper_departures.py {SHARED}/experiment"),
     "backgrounds": Figure(pages=("paper-map.md",), command=f"compare_backgrounds.py {SHARED}/experiment"),
     "search": Figure(pages=("accuracy.md",), command=f"bench_search.py {SHARED}/experiment"),
