@@ -50,7 +50,7 @@ def model_of(**changes) -> SphereModel:
 
 
 def begin() -> PoseStart:
-    precision = 4.0 * torch.eye(3, dtype=torch.float64).expand(10, 3, 3)
+    precision = 50.0 * torch.eye(3, dtype=torch.float64).expand(10, 3, 3)
     return PoseStart(moved(X, 0.05, 1), turned(R, 0.5, 1), torch.arange(20).reshape(10, 2) != 5, precision)
 
 
