@@ -13,6 +13,7 @@ import yaml
 
 from sphereorient import so3
 from sphereorient.assemble import Chosen
+from sphereorient.bench.scenes import BenchmarkScene, BenchSettings, write_scene
 from sphereorient.errors import ExperimentError
 from sphereorient.follow.appearance.map_odds import LEAST_ODDS, VIEWS, MapOdds, pose_log_odds
 from sphereorient.methods.results import with_map_odds
@@ -76,21 +77,41 @@ def test_pictures_add_their_odds_and_one_without_a_disk_adds_none():
 
 
 def test_a_map_that_is_its_own_mirror_image_is_no_chance():
-    odds(0.97, 0.97).check(["cam1"], found=True)
+    odds(0.97, 0.97).check(["cam1"], choices=1)
 
 
 def test_the_camera_that_is_mirrored_is_named():
     seen = MapOdds(score=torch.tensor([[0.95, 0.3]]), mirrored=torch.tensor([[0.4, 0.95]]))
     with pytest.raises(ExperimentError, match=r"flip: \{cam2: horizontal\}"):
-        seen.check(["cam1", "cam2"], found=True)
+        seen.check(["cam1", "cam2"], choices=1)
 
 
 def test_a_map_that_explains_what_chance_does_is_refused_where_poses_were_found():
     doubtful = odds(0.42, 0.4)
     assert float(doubtful.log_odds) < math.log(LEAST_ODDS)
-    doubtful.check(["cam1"], found=False)
+    doubtful.check(["cam1"], choices=0)
     with pytest.raises(ExperimentError, match="odds"):
-        doubtful.check(["cam1"], found=True)
+        doubtful.check(["cam1"], choices=1)
+
+
+def test_the_best_of_many_pictures_needs_larger_odds():
+    likely = odds(0.65, 0.4)
+    choices = round(math.exp(float(likely.log_odds)) / LEAST_ODDS)
+    assert choices > 3
+    likely.check(["cam1"], choices=choices - 1)
+    with pytest.raises(ExperimentError, match="chance"):
+        likely.check(["cam1"], choices=choices + 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("among", ["odds", "light"])
+def test_a_small_half_hidden_ball_of_which_one_frame_fits_by_chance_is_refused(tmp_path, monkeypatch, among):
+    if among == "light":  # the light learnt at such a pose explains no more than a disk without paint
+        monkeypatch.setattr(MapOdds, "check", lambda *_, **__: None)
+    mixed = {"ball_size": 5, "highlights": 5, "occlusion": 5}
+    scene = BenchmarkScene(kind="together", level=5, seed=1, number=0, degradations=mixed, plan=BenchSettings())
+    with pytest.raises(ExperimentError, match="chance" if among == "odds" else "without paint"):
+        track_movies(write_scene(tmp_path / "scene", scene))
 
 
 @pytest.mark.slow

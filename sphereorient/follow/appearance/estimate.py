@@ -1,10 +1,11 @@
 """Estimation of the appearance before tracking: presence, agreement, light, blur, worn paint, exposure."""
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 
-from sphereorient.errors import ExperimentError
+from sphereorient.errors import ExperimentError, refusal
 from sphereorient.follow.appearance.agreement import ProvenPoses, agreeing_poses, limb_px, proven_poses, usual_apart_rad
 from sphereorient.follow.appearance.exposure import with_motion
 from sphereorient.follow.appearance.light import (
@@ -15,6 +16,7 @@ from sphereorient.follow.appearance.light import (
 )
 from sphereorient.follow.appearance.map_odds import FEW, map_odds
 from sphereorient.follow.appearance.presence import (
+    LOOK_ALIKE,
     NO_BETTER,
     explained,
     find_poses,
@@ -114,7 +116,8 @@ def _chosen(
         posed = [k for k, poses in enumerate(found) if len(poses)]
         some = range(len(frames)) if few else (sure or posed)[:FEW]
         odds = map_odds(search, [frames[k] for k in some], [found[k] for k in some], only=among is None)
-        odds.check([view.name for view in search.fitter.views], found=bool(sure))
+        choices = 1 if few else math.comb(len(posed), len(sure))
+        odds.check([view.name for view in search.fitter.views], choices=choices if sure else 0)
         log_odds = float(odds.log_odds.sum()) if few else None
     sample = agreeing_poses(search, frames, found) if among is None else proven_poses(found)
     return search, found, sample, log_odds
@@ -131,12 +134,18 @@ def _matched(search: Initialiser, studied: Studied) -> Initialiser | None:
 def _score_min(studied: Studied, still: float, best: float, wrong: float) -> float:
     """Return the score between wrong and right poses. `still`: the typical one with the sphere rendered at rest, as in
     a search; `best` and `wrong`: explained by the map before the light was known.
+
+    Raises:
+        ExperimentError: with the estimated light the map explains no more than a disk without paint, whose score is 0.
     """
     right = studied.right_score
+    if min(right, still) < NO_BETTER:
+        got = f"best poses that explain {100 * right:.0f} % of the pictures, about as much as a disk without paint"
+        raise ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=LOOK_ALIKE))
     if right < wrong + NO_BETTER:
         # Dirt or a hidden rim spoils the estimated light: all poses explain less than before.
         wrong = right - (best - wrong)
     least = min(right, still)
     score_min = 0.5 * (least + min(wrong, least))
     # Out of focus, wrong poses explain nearly as much.
-    return min(score_min, clear_of(right)) if soft(studied.fitter) else score_min
+    return max(NO_BETTER, min(score_min, clear_of(right)) if soft(studied.fitter) else score_min)

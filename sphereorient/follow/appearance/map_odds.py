@@ -40,8 +40,10 @@ class MapOdds:
         likelier = pose_log_odds(self.score, self.mirrored, BEYOND_CHANCE) - pose_log_odds(self.mirrored, self.score)
         return likelier.nan_to_num(0.0).sum(0)
 
-    def check(self, cameras: Sequence[str], *, found: bool) -> None:
-        """Raise ExperimentError if the mirror image is likelier or, with poses `found`, chance explains as much."""
+    def check(self, cameras: Sequence[str], *, choices: int) -> None:
+        """Raise ExperimentError if the mirror image is likelier or chance explains as much; `choices`: the number of
+        sets of pictures of which these are the best, 0 if no pose is proven.
+        """
         odds, scores = self.log_odds, [_percent(one) for one in (self.score, self.mirrored)]
         both = zip(cameras, *scores, strict=True)
         got = "a map that explains " + ", ".join(
@@ -52,8 +54,8 @@ class MapOdds:
             flip = ", ".join(f"{name}: horizontal" for name in wrong)
             do = f"write flip: {{{flip}}}, remove an existing one, or correct a map that is mirrored or upside down"
             raise ExperimentError(refusal("movies", expected="pictures that are not mirrored", got=got, do=do))
-        if found and float(odds.sum()) < math.log(LEAST_ODDS):
-            got += f": odds of {_odds_words(odds.sum())} against chance"
+        if choices and (against := odds.sum() - math.log(choices)) < math.log(LEAST_ODDS):
+            got += f": odds of {_odds_words(against)} against chance"
             expected = f"a map with odds of {LEAST_ODDS:.0f} to 1"
             raise ExperimentError(refusal("movies", expected=expected, got=got, do=LOOK_ALIKE))
 
