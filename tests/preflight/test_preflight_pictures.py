@@ -79,8 +79,15 @@ def between(clean: Example, name: str, before: int, frames: slice, after: int) -
 
 
 @pytest.mark.slow
-def test_frames_without_a_ball_are_named_and_are_not_dark(clean, tmp_path):
+@pytest.mark.parametrize("something", [False, True], ids=["nothing", "a faint blob"])
+def test_frames_without_a_ball_are_named_and_are_not_dark(clean, tmp_path, something):
     late = replace(clean, pictures={name: between(clean, name, 30, slice(None), 10) for name in clean.pictures})
+    if something:  # out of focus behind the place of the ball
+        for movie in late.pictures.values():
+            v, u = np.mgrid[: movie.shape[1], : movie.shape[2]]
+            blob = 25.0 * np.exp(-0.5 * ((u - movie.shape[2] / 3) ** 2 + (v - movie.shape[1] / 3) ** 2) / 12.0**2)
+            empty = np.r_[:30, len(movie) - 10 : len(movie)]
+            movie[empty] = np.clip(movie[empty] + blob, 0, 255).astype(np.uint8)
     result = checked(late, tmp_path, sphere=PAINTED)
     assert complaints(result) == []
     measured = of(result, "ball cam1").measured
