@@ -1,12 +1,13 @@
 """Make the tables and figures of the docs that hold numbers; list those older than the code they measure.
 
-    scripts/figures.py                   # what is older or was never made, in order; a second call goes on
+    scripts/figures.py --jobs 2          # what is older or was never made, two at a time; a second call goes on
     scripts/figures.py --only NAME ...   # these, in any case
     scripts/figures.py --list            # makes nothing; exits 1 where a figure is older than its code
 
 A command writes its page itself, or prints Markdown whose tables go between the page's marks
 `<!-- figure NAME -->` and `<!-- end NAME -->`; what it prints is kept in out/figures. Numbers within sentences are
-copied by hand from there. docs/figures.md holds the CPU, and date, commit and CPU time of each figure.
+copied by hand from there. docs/figures.md holds the CPU, and date, commit and CPU time of each figure. Figures of
+times, and those that use another one, are made last, one by one.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ import argparse
 import os
 import platform
 import re
-import resource
 import shlex
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 
 import kept
 
@@ -40,6 +42,7 @@ class Figure:
     pages: tuple[str, ...]  # of docs/
     command: str  # a script of scripts/, or the program's name, with its arguments
     tables: tuple[str, ...] = ()  # marks of the tables that it prints, in their order; none: it writes, or text only
+    last: bool = False  # it measures times or uses another figure: made alone, after the others
 
 
 FIGURES: dict[str, Figure] = {
@@ -51,7 +54,7 @@ FIGURES: dict[str, Figure] = {
     "clean": Figure(pages=("accuracy.md",), command="clean_renders.py --count 100", tables=("clean",)),
     "basin": Figure(pages=("tracking.md",), command="basin.py", tables=("basin",)),
     "repair": Figure(pages=("assembly.md",), command="figure_repair.py"),
-    "assembly": Figure(pages=("assembly.md",), command="bench_assembly.py"),
+    "assembly": Figure(pages=("assembly.md",), command="bench_assembly.py", last=True),
     "calibration": Figure(pages=("calibration.md",), command="figure_calibration.py"),
     "paint": Figure(pages=("paint-design.md",), command="figure_paint_design.py"),
     "wear": Figure(pages=("map.md",), command="figure_wear_series.py"),
@@ -68,6 +71,7 @@ FIGURES: dict[str, Figure] = {
         pages=("accuracy.md",),
         command=f"accuracy.py {SHARED}/experiment {SHARED}/tank {SHARED}/gloss --benchmark out/robustness/results.json",
         tables=("accuracy", "stated"),
+        last=True,
     ),
     "stated-parts": Figure(
         pages=("accuracy.md",),
@@ -86,12 +90,14 @@ FIGURES: dict[str, Figure] = {
     "plates": Figure(pages=("accuracy.md",), command=f"plate_pictures.py {SHARED}/experiment"),
     "bumped": Figure(pages=("accuracy.md",), command=f"self_calibration.py {SHARED}/experiment"),
     "memory": Figure(
-        pages=("accuracy.md",), command=f"bench_memory.py {SHARED}/experiment/experiment.yaml --times 1 5 10"
+        pages=("accuracy.md",),
+        command=f"bench_memory.py {SHARED}/experiment/experiment.yaml --times 1 5 10",
+        last=True,
     ),
     "departures": Figure(pages=("paper-map.md",), command=f"paper_departures.py {SHARED}/experiment"),
     "backgrounds": Figure(pages=("paper-map.md",), command=f"compare_backgrounds.py {SHARED}/experiment"),
-    "search": Figure(pages=("accuracy.md",), command=f"bench_search.py {SHARED}/experiment"),
-    "speed": Figure(pages=("precise.md",), command=f"bench_speed.py {SHARED}/experiment"),
+    "search": Figure(pages=("accuracy.md",), command=f"bench_search.py {SHARED}/experiment", last=True),
+    "speed": Figure(pages=("precise.md",), command=f"bench_speed.py {SHARED}/experiment", last=True),
     "proposer": Figure(pages=("proposer.md",), command="bench_proposer.py --docs"),
     "designs": Figure(pages=("proposer.md",), command="proposer_designs.py --minutes 5", tables=("designs",)),
     "learnt-path": Figure(pages=("assembly.md",), command="learn_path.py"),
@@ -112,12 +118,13 @@ FIGURES: dict[str, Figure] = {
     "tests": Figure(pages=("statistics.md",), command="statistics_tests.py"),
     "long-report": Figure(pages=("report.md",), command="bench_report.py out/long-report"),
     "report": Figure(pages=("report.md", "walkthrough.md"), command="figure_report.py"),
-    "live-faults": Figure(pages=("live.md",), command=f"live_faults.py {SHARED}/fixed_ball/experiment.yaml"),
-    "closed-loop": Figure(pages=("live.md",), command="closed_loop.py"),
+    "live-faults": Figure(pages=("live.md",), command=f"live_faults.py {SHARED}/fixed_ball/experiment.yaml", last=True),
+    "closed-loop": Figure(pages=("live.md",), command="closed_loop.py", last=True),
     "live": Figure(
         pages=("live.md",),
         command=f"sphereorient bench live {SHARED}/experiment/experiment.yaml --cameras cam1"
         " --rate 200,300,400,500 --load 1 --loop --seconds 30",
+        last=True,
     ),
     "paper": Figure(pages=("paper.md",), command="reproduce_paper.py --out out/paper --docs"),
 }
@@ -182,25 +189,25 @@ def write_page(made: dict[str, Made]) -> None:
     write_text(PAGE, "\n".join(["<!-- made by sphereorient -->", *lines, ""]))
 
 
-def make(name: str, figure: Figure) -> Made:
-    """Run the command of a figure and put its tables into their pages."""
+def make(name: str, figure: Figure, threads: int | None = None) -> tuple[Made, list[str]]:
+    """Run the command of a figure; return its row and the tables that it prints. Raises RuntimeError: it failed."""
     program, *arguments = shlex.split(figure.command)
     place = Path(sys.executable).with_name(program) if program == "sphereorient" else kept.SCRIPTS / program
     command = [str(place), *arguments] if program == "sphereorient" else [sys.executable, str(place), *arguments]
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    run = subprocess.run(command, cwd=REPO, stdout=subprocess.PIPE, text=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    if run.returncode:
-        raise SystemExit(f"figures.py: {name}: {figure.command} ended with {run.returncode}; see above")
+    environment = os.environ | ({} if threads is None else {"OMP_NUM_THREADS": str(threads)})
     OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / f"{name}.md").write_text(run.stdout, "utf-8")
-    printed = tables_of(run.stdout)
+    with (OUT / f"{name}.md").open("w+", encoding="utf-8") as file:
+        run = subprocess.Popen(command, cwd=REPO, stdout=file, env=environment)
+        _, status, used = os.wait4(run.pid, 0)
+        run.returncode = os.waitstatus_to_exitcode(status)
+        file.seek(0)
+        printed = tables_of(file.read())
+    if run.returncode:
+        raise RuntimeError(f"{name}: {figure.command} ended with {run.returncode}; see above")
     if len(printed) < len(figure.tables):
-        raise SystemExit(f"figures.py: {name}: expected {len(figure.tables)} tables, got {len(printed)}")
-    for mark, table in zip(figure.tables, printed, strict=False):
-        insert(DOCS / figure.pages[0], mark, table)
-    cpu_s = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
-    return Made(time.strftime("%Y-%m-%d"), kept.commit(), f"{cpu_s:.0f}", code_of(figure))
+        raise RuntimeError(f"{name}: expected {len(figure.tables)} tables, got {len(printed)}")
+    cpu_s = f"{used.ru_utime + used.ru_stime:.0f}"
+    return Made(time.strftime("%Y-%m-%d"), kept.commit(), cpu_s, code_of(figure)), printed
 
 
 def tables_of(text: str) -> list[str]:
@@ -221,6 +228,7 @@ def main() -> None:
     """Read the options; make, or list."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", metavar="NAME", choices=list(FIGURES), default=None)
+    parser.add_argument("--jobs", type=int, default=1, help="figures at a time, each on one thread if more than one")
     parser.add_argument("--list", action="store_true")
     options = parser.parse_args()
     made = rows()
@@ -228,11 +236,29 @@ def main() -> None:
     if options.list:
         print("\n".join(f"{name:20} {'older' if name in older else 'as now'}" for name in FIGURES))
         sys.exit(bool(older))
-    for name in options.only or older:
+    lock, failed = Lock(), []
+
+    def one(name: str, threads: int | None = None) -> None:
         print(f"{name}: {FIGURES[name].command}", file=sys.stderr, flush=True)
-        row = make(name, FIGURES[name])
-        write_page(rows() | {name: row})  # another call may have added its rows meanwhile
+        try:
+            row, printed = make(name, FIGURES[name], threads)
+        except RuntimeError as error:  # the others go on
+            failed.append(str(error))
+            return
+        with lock:
+            for mark, table in zip(FIGURES[name].tables, printed, strict=False):
+                insert(DOCS / FIGURES[name].pages[0], mark, table)
+            write_page(rows() | {name: row})  # another call may have added its rows meanwhile
+
+    wanted = options.only or older
+    with ThreadPoolExecutor(options.jobs) as pool:
+        threads = 1 if options.jobs > 1 else None
+        list(pool.map(lambda name: one(name, threads), [name for name in wanted if not FIGURES[name].last]))
+    for name in wanted:
+        if FIGURES[name].last:
+            one(name)
     write_page(rows())
+    sys.exit("figures.py: " + "\n".join(failed) if failed else 0)
 
 
 if __name__ == "__main__":
