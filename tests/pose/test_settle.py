@@ -33,6 +33,7 @@ from sphereorient.pose.pixels import LinesOfSight
 from sphereorient.pose.poses import POSE_PARTS, PoseStart
 
 RIG, COUNT = rig_of(), 6
+ONE_CAMERA = 1  # the pose that one camera sees
 pytestmark = pytest.mark.skipif(
     compiled.refine_library() is None, reason="needs the compiled fit: `make setup` with a compiler"
 )
@@ -63,7 +64,7 @@ def start(X, R, *, held: bool = False) -> PoseStart:
     count = len(X)
     off = torch.linspace(0.05, 2.0, count).tolist()
     use = torch.ones(count, 2, dtype=torch.bool)
-    use[1, 0] = False
+    use[ONE_CAMERA, 0] = False
     return PoseStart(
         position_lab_mm=X if held else torch.cat([moved(X[k : k + 1], 0.05 * off[k], k) for k in range(count)]),
         R_lab_body=torch.cat([turned(R[k : k + 1], off[k], k) for k in range(count)]),
@@ -75,14 +76,22 @@ def start(X, R, *, held: bool = False) -> PoseStart:
 
 
 def assert_same(found, expected) -> None:
+    both = torch.arange(COUNT) != ONE_CAMERA
     turned = so3.log(found.R_lab_body @ expected.R_lab_body.mT)
-    apart = torch.cat([turned, found.position_lab_mm - expected.position_lab_mm], dim=-1)
-    # In sigmas: the last steps of a fit are not small beside rounding, if one camera alone sees the ball.
-    assert float((apart / expected.covariance.diagonal(dim1=-2, dim2=-1).sqrt()).abs().max()) < 0.2
+    moved_mm = found.position_lab_mm - expected.position_lab_mm
+    assert float(torch.rad2deg(turned.norm(dim=-1))[both].max()) < 2e-3
+    assert float(moved_mm.norm(dim=-1)[both].max()) < 5e-4
+    covered = (found.limb_coverage - expected.limb_coverage).abs()
+    assert float(covered[both].max()) < 0.01
+    variances = [part.covariance.diagonal(dim1=-2, dim2=-1) for part in (found, expected)]
+    ratio = (variances[0] / variances[1] - 1).abs()
+    assert float(ratio[both].max()) < 0.02
     assert float((found.score - expected.score).abs().max()) < 1e-3
-    assert float((found.limb_coverage - expected.limb_coverage).abs().max()) < 0.02
-    sigmas = [part.covariance.diagonal(dim1=-2, dim2=-1) for part in (found, expected)]
-    assert float((sigmas[0] / sigmas[1] - 1).abs().max()) < 0.05
+    # The last steps of a fit by one camera are not small beside rounding: compared in sigmas.
+    apart = (torch.cat([turned, moved_mm], dim=-1) / variances[1].sqrt())[ONE_CAMERA]
+    assert float(apart.abs().max()) < 0.2
+    assert float(covered[ONE_CAMERA].max()) < 0.02
+    assert float(ratio[ONE_CAMERA].max()) < 0.05
 
 
 @pytest.mark.parametrize("kind", KINDS)

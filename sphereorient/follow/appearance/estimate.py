@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 
-from sphereorient.errors import ExperimentError, refusal
+from sphereorient.errors import ExperimentError
 from sphereorient.follow.appearance.agreement import ProvenPoses, agreeing_poses, limb_px, proven_poses, usual_apart_rad
 from sphereorient.follow.appearance.exposure import with_motion
 from sphereorient.follow.appearance.light import (
@@ -16,11 +16,11 @@ from sphereorient.follow.appearance.light import (
 )
 from sphereorient.follow.appearance.map_odds import FEW, map_odds
 from sphereorient.follow.appearance.presence import (
-    LOOK_ALIKE,
     NO_BETTER,
     explained,
     find_poses,
     for_blur,
+    no_better_error,
     proven,
     second_ball,
     seldom,
@@ -116,8 +116,8 @@ def _chosen(
         posed = [k for k, poses in enumerate(found) if len(poses)]
         some = range(len(frames)) if few else (sure or posed)[:FEW]
         odds = map_odds(search, [frames[k] for k in some], [found[k] for k in some], only=among is None)
-        choices = 1 if few else math.comb(len(posed), len(sure))
-        odds.check([view.name for view in search.fitter.views], choices=choices if sure else 0)
+        choices = 0 if not sure else 1 if few else math.comb(len(posed), len(sure))
+        odds.check([view.name for view in search.fitter.views], choices=choices)
         log_odds = float(odds.log_odds.sum()) if few else None
     sample = agreeing_poses(search, frames, found) if among is None else proven_poses(found)
     return search, found, sample, log_odds
@@ -140,8 +140,7 @@ def _score_min(studied: Studied, still: float, best: float, wrong: float) -> flo
     """
     right = studied.right_score
     if min(right, still) < NO_BETTER:
-        got = f"best poses that explain {100 * right:.0f} % of the pictures, about as much as a disk without paint"
-        raise ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=LOOK_ALIKE))
+        raise no_better_error(right, "a disk without paint")
     if right < wrong + NO_BETTER:
         # Dirt or a hidden rim spoils the estimated light: all poses explain less than before.
         wrong = right - (best - wrong)

@@ -67,9 +67,14 @@ def explained(found: Sequence[Poses], clear: Sequence[int]) -> tuple[float, floa
     wrong = torch.cat([found[k].score[1:][:, found[k].use].reshape(-1) for k in clear])
     best, highest = float(right.median()), float(wrong.quantile(0.9)) if len(wrong) else 0.0
     if best < highest + NO_BETTER and _times_better(found, clear) < TELLING:
-        got = f"best poses that explain {100 * best:.0f} % of the pictures, about as much as wrong poses"
-        raise ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=LOOK_ALIKE))
+        raise no_better_error(best, "wrong poses")
     return best, highest
+
+
+def no_better_error(score: float, than: str) -> ExperimentError:
+    """Return the error for a map whose best poses, of this score, explain about as much as something without it."""
+    got = f"best poses that explain {100 * score:.0f} % of the pictures, about as much as {than}"
+    return ExperimentError(refusal("movies", expected="frames that the map explains", got=got, do=LOOK_ALIKE))
 
 
 def _times_better(found: Sequence[Poses], clear: Sequence[int]) -> float:
