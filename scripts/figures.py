@@ -17,6 +17,7 @@ import os
 import platform
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import time
@@ -43,6 +44,7 @@ class Figure:
     command: str  # a script of scripts/, or the program's name, with its arguments
     tables: tuple[str, ...] = ()  # marks of the tables that it prints, in their order; none: it writes, or text only
     last: bool = False  # it measures times or uses another figure: made alone, after the others
+    keeps: str = ""  # folder of out/ with parts that an interrupted run goes on with; of older code: removed
 
 
 FIGURES: dict[str, Figure] = {
@@ -66,7 +68,9 @@ FIGURES: dict[str, Figure] = {
         command=f"accuracy.py {SHARED}/experiment --method paper --no-synth",
         tables=("paper-method",),
     ),
-    "robustness": Figure(pages=("robustness.md",), command="bench_robustness.py --out out/robustness"),
+    "robustness": Figure(
+        pages=("robustness.md",), command="bench_robustness.py --out out/robustness", keeps="robustness"
+    ),
     "accuracy": Figure(
         pages=("accuracy.md",),
         command=f"accuracy.py {SHARED}/experiment {SHARED}/tank {SHARED}/gloss --benchmark out/robustness/results.json",
@@ -77,11 +81,12 @@ FIGURES: dict[str, Figure] = {
         pages=("accuracy.md",),
         command=f"stated_errors.py {SHARED} --only sets movies both stills",
         tables=("stated-sets", "stated-one", "stated-two", "stated-stills"),
+        keeps="stated",
     ),
-    "stills": Figure(pages=("robustness.md",), command="single_stills.py --stills 3"),
+    "stills": Figure(pages=("robustness.md",), command="single_stills.py --stills 3", keeps="single-stills"),
     "limits": Figure(pages=("robustness.md",), command="light_limits.py", tables=("limits",)),
-    "density": Figure(pages=("robustness.md",), command="sphereorient bench balls --out out/balls"),
-    "reliability": Figure(pages=("robustness.md",), command="reliability.py"),
+    "density": Figure(pages=("robustness.md",), command="sphereorient bench balls --out out/balls", keeps="balls"),
+    "reliability": Figure(pages=("robustness.md",), command="reliability.py", keeps="reliability"),
     "cameras": Figure(
         pages=("accuracy.md", "errors.md"),
         command=f"port_or_not.py {SHARED}/tank --figure docs/port_or_not.png",
@@ -111,7 +116,7 @@ FIGURES: dict[str, Figure] = {
     "photographs-maps": Figure(pages=("map.md",), command="photographs.py --moves --counts 12 30 --sets 3"),
     "fly": Figure(pages=("map.md",), command="real_fictrac.py"),
     "fictrac-axes": Figure(pages=("fictrac.md",), command="fictrac_axes.py"),
-    "scenes": Figure(pages=("fictrac.md",), command="sphereorient bench ball --out out/ball"),
+    "scenes": Figure(pages=("fictrac.md",), command="sphereorient bench ball --out out/ball", keeps="ball"),
     "dots": Figure(pages=("photographs.md",), command="real_spindoe.py"),
     "moon": Figure(pages=("moon.md",), command=f"moon.py {SHARED}/real/moon", tables=("moon",)),
     "statistics": Figure(pages=("statistics.md",), command="ensemble_coverage.py"),
@@ -196,6 +201,8 @@ def make(name: str, figure: Figure, threads: int | None = None) -> tuple[Made, l
     command = [str(place), *arguments] if program == "sphereorient" else [sys.executable, str(place), *arguments]
     environment = os.environ | ({} if threads is None else {"OMP_NUM_THREADS": str(threads)})
     OUT.mkdir(parents=True, exist_ok=True)
+    if figure.keeps:
+        remove_older(OUT.parent / figure.keeps, code_of(figure))
     with (OUT / f"{name}.md").open("w+", encoding="utf-8") as file:
         run = subprocess.Popen(command, cwd=REPO, stdout=file, env=environment)
         _, status, used = os.wait4(run.pid, 0)
@@ -208,6 +215,14 @@ def make(name: str, figure: Figure, threads: int | None = None) -> tuple[Made, l
         raise RuntimeError(f"{name}: expected {len(figure.tables)} tables, got {len(printed)}")
     cpu_s = f"{used.ru_utime + used.ru_stime:.0f}"
     return Made(time.strftime("%Y-%m-%d"), kept.commit(), cpu_s, code_of(figure)), printed
+
+
+def remove_older(folder: Path, code: str) -> None:
+    """Remove a folder whose parts other code has made; write which code makes them now."""
+    if folder.is_dir() and kept.known(folder).get("code") != code:
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    kept.note(folder, code=code)
 
 
 def tables_of(text: str) -> list[str]:
