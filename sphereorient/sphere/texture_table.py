@@ -34,6 +34,7 @@ CHUNK = 1 << 14  # directions per batch while a table is built
 STEPS = 127.0  # white paint in a direction table; black is its negative
 AT_ONCE = 1 << 17  # pixels looked up at once, so that temporaries stay in the cache
 SIDE = 512  # cells per axis of the finest table: 0.4 degrees, 4 MB
+SAME = 1 + 1e-9  # ratio of blurs that differ by rounding
 WIDER = 1.6  # largest ratio of blur in a step: the 9-point rule is exact for maps smooth over the added width
 CELLS_A_BLUR = 3.0  # least cells per blur sigma in coarser tables
 
@@ -140,8 +141,10 @@ class TextureTable:
         return cls(rows, blur_rad, cls.of(hidden) if hidden else None)
 
     def blurred(self, blur_rad: float) -> "TextureTable":
-        """Return a table whose total blur is `blur_rad`, or itself if that is not wider."""
-        if blur_rad <= self.blur_rad:
+        """Return a table whose total blur is `blur_rad`, or itself if that is not wider but for rounding: a fit then
+        uses a map that grows.
+        """
+        if blur_rad <= SAME * self.blur_rad:
             return self
         return self._wider.blurred(blur_rad) if blur_rad > WIDER * self.blur_rad else self._widened(blur_rad)
 

@@ -118,6 +118,18 @@ def test_the_first_pass_follows_a_ball_without_a_map(ball):
     assert 0.005 < float(torch.rad2deg(sigma.median())) < 0.3
 
 
+def test_the_fit_uses_the_map_that_grows_whatever_the_rounding_of_the_radius(ball, monkeypatch):
+    exact = CameraView.radius_px
+
+    def rounded(view: CameraView, position_lab_mm: torch.Tensor, radius_mm: float) -> torch.Tensor:
+        """As vector instructions, which round the radii of many positions otherwise than that of one."""
+        return exact(view, position_lab_mm, radius_mm) * (1.0 - 2e-16 * (position_lab_mm.ndim - 1))
+
+    monkeypatch.setattr(CameraView, "radius_px", rounded)
+    found = followed(ball, range(2), replace(ball.place, position_lab_mm=ball.X[:1]))
+    assert all(map(supported, found))
+
+
 def test_a_jump_is_found_and_another_thing_is_none(ball):
     place = replace(ball.place, position_lab_mm=ball.X[:1])
     follower = FirstPass(place)

@@ -212,6 +212,7 @@ def test_a_table_is_not_made_sharper():
     table = table_of("patches", 0.03)
     assert table.blurred(0.03) is table
     assert table.blurred(0.01) is table
+    assert table.blurred(math.nextafter(0.03, 1.0)) is table  # the same but for rounding
 
 
 def test_a_wider_blur_needs_no_more_cells():
