@@ -4,9 +4,9 @@
 
 Movies: two synthetic ones of other paints, rendered here; and, where they are there, the shared experiment, its camera
 cam1 alone, and the fixed ball. `sphereorient map` learns each map and `sphereorient track` tracks with it, in processes
-of their own, one thread. The map is compared with the exact one by our `compare_maps` and by the shared score_map.py,
-if it is there. Prints one Markdown table; after the row of the fixed ball a second one, with FicTrac's result on the
-same movie beside ours.
+of their own, one thread. The map is compared with the exact one by the shared score_map.py, or, if that is not there,
+by our `compare_maps`. Prints one Markdown table; after the row of the fixed ball a second one, with FicTrac's result on
+the same movie beside ours.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -42,19 +41,22 @@ OFTEN = 10  # pictures from which on a place counts as well seen
 # Both show the ball from all sides within 240 frames.
 SCENE = SynthSettings(frames=240, image_size=(360, 360), volume_mm=30.0, omega_rms=16.0, omega_time=0.06)
 SYNTHETIC = {"synth_patches": ("patches", 4), "synth_dots": ("dots", 3)}  # paint and seed
+MOVIES = {
+    "experiment": "shared `experiment`, its map withheld, 240 frames of two cameras",
+    "experiment_cam1": "its camera `cam1` alone",
+    "synth_patches": "rendered, patches, 240 frames",
+    "synth_dots": "rendered, dots, 240 frames",
+    "fixed_ball": "shared `fixed_ball`: one camera, ball of unknown size in one place, 250 frames",
+}
 COLUMNS = (
     "movie",
-    "attitudes learnt with the map, p50 / p95 (°)",
-    "tracked with the map, p50 / p95 (°)",
-    "step p50 (°)",
-    f"sphere seen >= {OFTEN} times",
-    "paint displaced, rms / p50 / max (°), patches",
-    "score_map.py: rms / p50 (°), patches",
-    "map: CPU s, per frame, GB",
-    "track: CPU s, per frame, GB",
-    "map: wall s",
+    "attitudes learnt with the map, median / 95 %",
+    "tracked with the map",
+    f"seen {OFTEN} times",
+    "texture displaced, rms / median",
+    "`map`: CPU s, per frame, GB",
 )
-BESIDE = ("program", "absolute error, p50 / p95 (°)", "step error, p50 (°)", "CPU s per frame", "memory (GB)")
+BESIDE = ("program", "absolute error, median / 95 %", "step error, median", "CPU s per frame", "memory, GB")
 # Its q_factor, and CPU s per frame on movies of this kind, measured on the same kind of machine (shared
 # docs/ANCHORS.md, 2.1); its memory was not.
 FICTRAC = {6: "0.007", 10: "0.012 to 0.014"}
@@ -74,13 +76,12 @@ class Case:
 class Usage:
     """Time and memory of a process."""
 
-    wall_s: float
     cpu_s: float
     memory_gb: float
 
     def words(self, frames: int) -> list[str]:
         """Return CPU s per frame, and GB."""
-        return [f"{self.cpu_s / frames:.3f}", f"{self.memory_gb:.1f}"]
+        return [f"{self.cpu_s / frames:.2g}", f"{self.memory_gb:.1f}"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -130,12 +131,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         work = Path(temporary) if options.work is None else options.work
         work.mkdir(parents=True, exist_ok=True)
-        for name in [*SYNTHETIC, "experiment", "experiment_cam1", "fixed_ball"]:
+        for name in MOVIES:
             if options.only and name not in options.only:
                 continue
             case = case_of(name, work, options.shared)
             if case is None:
-                print(f"| {name} | not here: skipped |" + " |" * (len(COLUMNS) - 2), flush=True)
+                print(f"| {MOVIES[name]} | not here: skipped |" + " |" * (len(COLUMNS) - 2), flush=True)
                 continue
             row = measured(case, work, options.overrides)
             print(row_text(row, options.shared / "score_map.py"), flush=True)
@@ -180,15 +181,12 @@ def row_text(row: Row, yardstick: Path) -> str:
     case, frames = row.case, len(row.learnt)
     seen = read_seen(seen_path(row.texture))
     cells = [
-        case.name,
+        MOVIES[case.name],
         percentiles(row.learnt.errors_deg),
         percentiles(row.tracked.errors_deg),
-        f"{row.tracked.step_deg:.3f}",
-        "" if seen is None else f"{100 * shares_seen(seen, (OFTEN,))[0]:.1f} %",
-        *displaced(row.texture, load_experiment(case.experiment).texture_path, yardstick),
+        "" if seen is None else f"{100 * shares_seen(seen, (OFTEN,))[0]:.0f} %",
+        displaced(row.texture, load_experiment(case.experiment).texture_path, yardstick),
         ", ".join([f"{row.learning.cpu_s:.0f}", *row.learning.words(frames)]),
-        ", ".join([f"{row.tracking.cpu_s:.0f}", *row.tracking.words(frames)]),
-        f"{row.learning.wall_s:.0f}",
     ]
     return "| " + " | ".join(cells) + " |"
 
@@ -198,13 +196,13 @@ def beside_fictrac(row: Row) -> str:
     frames, R_true = len(row.learnt), row.learnt.R_true
     programs = [
         ("`sphereorient map`", row.learnt, row.learning.words(frames)),
-        ("`sphereorient track`, map learnt", row.tracked, row.tracking.words(frames)),
+        ("`sphereorient track`, with the learnt map", row.tracked, row.tracking.words(frames)),
     ]
     for factor, cpu in FICTRAC.items():
         path = row.case.experiment.parent / f"s90_4_q{factor}.dat"
         if path.is_file():
             theirs = Attitudes(R=aligned(fictrac_attitudes(path), R_true, row.case.both), R_true=R_true)
-            programs.append((f"FicTrac 2.1.2, q_factor {factor}", theirs, [cpu, "not measured"]))
+            programs.append((f"FicTrac 2.1.2, q_factor {factor}", theirs, [cpu, ""]))
     lines = ["| " + " | ".join(BESIDE) + " |", "|" + "---|" * len(BESIDE)]
     for name, found, cost in programs:
         lines.append("| " + " | ".join([name, percentiles(found.errors_deg), f"{found.step_deg:.3f}", *cost]) + " |")
@@ -225,15 +223,12 @@ def run(command: str, experiment: Path, out: Path, cameras: str | None, more: li
     """Run one command of ours to its end, on one thread."""
     words = [sys.executable, "-m", "sphereorient.cli", command, str(experiment), "--out", str(out), "--quiet", *more]
     words += [] if cameras is None else ["--cameras", cameras]
-    begun = time.perf_counter()
     process = subprocess.Popen(words, env={**os.environ, "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"})
     # wait4 returns the peak of this child.
     _, status, usage = os.wait4(process.pid, 0)
     if status:
         raise SystemExit(f"{' '.join(words)}: failed")
-    return Usage(
-        wall_s=time.perf_counter() - begun, cpu_s=usage.ru_utime + usage.ru_stime, memory_gb=usage.ru_maxrss / 1e6
-    )
+    return Usage(cpu_s=usage.ru_utime + usage.ru_stime, memory_gb=usage.ru_maxrss / 1e6)
 
 
 def truth(path: Path) -> Tensor:
@@ -270,26 +265,20 @@ def percentiles(angle_deg: Tensor) -> str:
     return words if len(known) == len(angle_deg) else f"{words} ({len(angle_deg) - len(known)} frames without)"
 
 
-def displaced(texture: Path, true: Path | None, yardstick: Path) -> list[str]:
-    """Return the displacement of the paint as text: by our measure, and by the shared one."""
+def displaced(texture: Path, true: Path | None, yardstick: Path) -> str:
+    """Return the displacement of the texture as text: by the shared measure if it is there, else by ours."""
     if true is None:
-        return ["no true map", ""]
-    seen = read_seen(seen_path(texture))
-    learnt = load_texture(texture)
-    learnt = learnt if seen is None else torch.where(seen >= OFTEN, learnt, torch.nan)
+        return "no exact map"
+    if yardstick.is_file():
+        words = [sys.executable, str(yardstick), str(texture), str(true), "--seen", str(seen_path(texture))]
+        scores = json.loads(subprocess.run(words, check=True, capture_output=True, text=True).stdout)
+        return f"{scores['distortion_rms_deg']:.3f} / {scores['distortion_p50_deg']:.3f}"
+    seen, learnt = read_seen(seen_path(texture)), load_texture(texture)
     try:
-        comparison = compare_maps(learnt, load_texture(true))
-        off = torch.rad2deg(comparison.length_rad)
-        rms = float(np.rad2deg(comparison.rms_rad))
-        own = f"{rms:.3f} / {float(off.median()):.3f} / {float(off.max()):.3f}, {len(off)}"
+        comparison = compare_maps(torch.where(seen >= OFTEN, learnt, torch.nan), load_texture(true))
     except PaintError as error:
-        own = str(error)
-    if not yardstick.is_file():
-        return [own, ""]
-    words = [sys.executable, str(yardstick), str(texture), str(true), "--seen", str(seen_path(texture))]
-    scores = json.loads(subprocess.run(words, check=True, capture_output=True, text=True).stdout)
-    rms, p50, used = scores["distortion_rms_deg"], scores["distortion_p50_deg"], scores["patches_used"]
-    return [own, f"{rms:.3f} / {p50:.3f}, {used}"]
+        return str(error)
+    return f"{np.rad2deg(comparison.rms_rad):.3f} / {float(torch.rad2deg(comparison.length_rad).median()):.3f}"
 
 
 if __name__ == "__main__":

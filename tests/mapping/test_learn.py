@@ -127,13 +127,15 @@ def test_a_ball_fixed_in_its_place_is_learnt_from_one_camera():
 
 @pytest.mark.slow
 @pytest.mark.shared
-def test_the_shared_experiment_is_learnt_without_its_texture(tmp_path):
+@pytest.mark.parametrize(("cameras", "median_deg"), [(None, 0.07), (["cam1"], 0.14)], ids=["both", "one"])
+def test_the_shared_experiment_is_learnt_without_its_texture(tmp_path, cameras, median_deg):
     path = SHARED / "experiment" / "experiment.yaml"
-    with opened(path) as recording:
+    with opened(path, cameras) as recording:
         learnt = mapped(recording, MapSettings())
     error = error_deg(learnt.R_lab_body, true_attitudes(path))
-    assert error.median() < 0.13
-    assert error.quantile(0.95) < 0.25
-    assert learnt.seen_share > 0.95
+    # With unsolved smooth distortions of the map one camera is off by 0.17 degrees.
+    assert error.median() < median_deg
+    assert error.quantile(0.95) < 2 * median_deg
+    assert cameras or learnt.seen_share > 0.95
     grey = (torch.nan_to_num(learnt.texture, nan=0.5) * 255).round().byte().numpy()
     assert cv2.imwrite(str(tmp_path / "learnt.png"), grey)
