@@ -201,8 +201,9 @@ def make(name: str, figure: Figure, threads: int | None = None) -> tuple[Made, l
     command = [str(place), *arguments] if program == "sphereorient" else [sys.executable, str(place), *arguments]
     environment = os.environ | ({} if threads is None else {"OMP_NUM_THREADS": str(threads)})
     OUT.mkdir(parents=True, exist_ok=True)
+    code = code_of(figure)  # before the run: a file that changes meanwhile is not what was measured
     if figure.keeps:
-        remove_older(OUT.parent / figure.keeps, code_of(figure))
+        remove_older(OUT.parent / figure.keeps, code)
     with (OUT / f"{name}.md").open("w+", encoding="utf-8") as file:
         run = subprocess.Popen(command, cwd=REPO, stdout=file, env=environment)
         _, status, used = os.wait4(run.pid, 0)
@@ -214,7 +215,7 @@ def make(name: str, figure: Figure, threads: int | None = None) -> tuple[Made, l
     if len(printed) < len(figure.tables):
         raise RuntimeError(f"{name}: expected {len(figure.tables)} tables, got {len(printed)}")
     cpu_s = f"{used.ru_utime + used.ru_stime:.0f}"
-    return Made(time.strftime("%Y-%m-%d"), kept.commit(), cpu_s, code_of(figure)), printed
+    return Made(time.strftime("%Y-%m-%d"), kept.commit(), cpu_s, code), printed
 
 
 def remove_older(folder: Path, code: str) -> None:
