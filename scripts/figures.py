@@ -83,7 +83,7 @@ FIGURES: dict[str, Figure] = {
         tables=("stated-sets", "stated-one", "stated-two", "stated-stills"),
         keeps="stated",
     ),
-    "stills": Figure(pages=("robustness.md",), command="single_stills.py --stills 3", keeps="single-stills"),
+    "stills": Figure(pages=("robustness.md",), command="single_stills.py --stills 3"),
     "limits": Figure(pages=("robustness.md",), command="light_limits.py", tables=("limits",)),
     "density": Figure(pages=("robustness.md",), command="sphereorient bench balls --out out/balls", keeps="balls"),
     "reliability": Figure(pages=("robustness.md",), command="reliability.py", keeps="reliability"),

@@ -68,6 +68,7 @@ def movies(out: Path) -> Iterator[Path]:
         for n, (name, level) in enumerate(DEGRADATIONS.items()):
             folder = out / f"{paint}-{name}"
             settings = SynthSettings(texture=paint, seed=501 + n + k * len(DEGRADATIONS), **SCENE)
+            shutil.rmtree(folder, ignore_errors=True)  # of an earlier run
             write_degraded(folder, settings, {name: level} if level else {})
             yield folder
 

@@ -48,6 +48,7 @@ BLUR_RATIO = 1.25  # between neighbouring trial blurs
 BLUR_PX = (0.25, 3.0)  # narrowest and widest
 BATCH = 24  # instants per batch
 LONGEST_RAD = 0.05  # joint step
+WHOLE = 0.999  # coverage of a pixel that the limb does not cross
 BLACK, WHITE = 0.03, 0.97  # shares of the sphere that count as black and white
 BEYOND = 0.2  # largest excess of the map over 0 .. 1 during iterations
 NOISE_EVERY = 4  # each n-th pixel, for the noise
@@ -77,6 +78,7 @@ class State:
     blur_px: float
     fitter: Fitter  # for views and light; its own map is not used
     fixed: bool  # whether all instants share one position
+    limb_share: float  # of the weight of pixels that the limb crosses
     weight: Tensor | None = None  # (H, 2 H) float64, of the texels in the map's last solution, see `map_weight`
     expected: Tensor | None = None  # (H, 2 H), paint without blur; the map's difference from it is penalised
 
@@ -118,7 +120,8 @@ class State:
         """Linearise all disks at once; unseen ones have weight 0."""
         X, R, paint = self.position_lab_mm, self.R_lab_body, SplineTable(self.texture, 0.0)
         at = linearise(self.fitter, paint, self.pixels, X, R, self.blur_px)
-        return replace(at, weight=at.weight * self.use.reshape(-1, 1))
+        share = torch.where(at.view.coverage < WHOLE, self.limb_share, 1.0)
+        return replace(at, weight=at.weight * share * self.use.reshape(-1, 1))
 
 
 def map_height(views: Sequence[CameraView], settings: MapSettings) -> int:
@@ -152,6 +155,8 @@ def first_state(
     pixels, use = pixels_of(crops, fitter, frames, settings.pixels, extra_px), crops.seen[frames]
     X = crops.position_lab_mm[frames]
     paint: dict[str, Any] = {"texture": texture, "blur_px": blur_px, "fitter": fitter, "fixed": crops.fixed}
+    # The error of a fixed ball's limb is the same in all pictures: together they count as one.
+    paint["limb_share"] = 1.0 / len(frames) if crops.fixed else 1.0
     return State(frames=frames, pixels=pixels, use=use, position_lab_mm=X, R_lab_body=R_lab_body, **paint)
 
 

@@ -118,9 +118,9 @@ def test_a_ball_fixed_in_its_place_is_learnt_from_one_camera():
     true = true_attitudes(path)
     R = learnt.R_lab_body
     P, _ = turns_on_both_sides(R, true)
-    assert error_deg(P @ R, true).median() < 0.05
+    assert error_deg(P @ R, true).median() < 0.01  # 0.013 if the limb counts anew in each picture
     step = torch.rad2deg(geodesic_distance(R[1:] @ R[:-1].mT, P.mT @ true[1:] @ true[:-1].mT @ P))
-    assert step.median() < 0.05
+    assert step.median() < 0.02
     assert learnt.position_lab_mm.std(0).max() < 1e-9
     assert learnt.blur_px == pytest.approx(12**-0.5, rel=0.15)  # of a pixel alone
 
