@@ -232,11 +232,11 @@ def tables_of(text: str) -> list[str]:
 
 
 def insert(page: Path, mark: str, table: str) -> None:
-    """Put a table between the marks of a page."""
+    """Put a table between the marks of a page. Raises RuntimeError: the page lacks them."""
     text = page.read_text("utf-8")
     pattern = rf"(<!-- figure {re.escape(mark)} -->\n).*?(<!-- end {re.escape(mark)} -->)"
     if len(re.findall(pattern, text, re.DOTALL)) != 1:
-        raise SystemExit(f"figures.py: {page}: expected one pair of marks of figure {mark}")
+        raise RuntimeError(f"{page}: expected one pair of marks of figure {mark}")
     page.write_text(re.sub(pattern, lambda found: f"{found[1]}{table}\n{found[2]}", text, flags=re.DOTALL), "utf-8")
 
 
@@ -258,13 +258,12 @@ def main() -> None:
         print(f"{name}: {FIGURES[name].command}", file=sys.stderr, flush=True)
         try:
             row, printed = make(name, FIGURES[name], threads)
+            with lock:
+                for mark, table in zip(FIGURES[name].tables, printed, strict=False):
+                    insert(DOCS / FIGURES[name].pages[0], mark, table)
+                write_page(rows() | {name: row})  # another call may have added its rows meanwhile
         except RuntimeError as error:  # the others go on
             failed.append(str(error))
-            return
-        with lock:
-            for mark, table in zip(FIGURES[name].tables, printed, strict=False):
-                insert(DOCS / FIGURES[name].pages[0], mark, table)
-            write_page(rows() | {name: row})  # another call may have added its rows meanwhile
 
     wanted = options.only or older
     with ThreadPoolExecutor(options.jobs) as pool:

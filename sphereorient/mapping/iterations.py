@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -153,11 +152,19 @@ def first_state(
     table = optics_of(texture, crops.views, blur_px, grid.ROUGH_SIDE).fine.paint  # only for its blur, see `State`
     fitter = first_fitter(crops.views, crops.radius_mm, table, blur_px)
     pixels, use = pixels_of(crops, fitter, frames, settings.pixels, extra_px), crops.seen[frames]
-    X = crops.position_lab_mm[frames]
-    paint: dict[str, Any] = {"texture": texture, "blur_px": blur_px, "fitter": fitter, "fixed": crops.fixed}
-    # The error of a fixed ball's limb is the same in all pictures: together they count as one.
-    paint["limb_share"] = 1.0 / len(frames) if crops.fixed else 1.0
-    return State(frames=frames, pixels=pixels, use=use, position_lab_mm=X, R_lab_body=R_lab_body, **paint)
+    return State(
+        frames=frames,
+        pixels=pixels,
+        use=use,
+        position_lab_mm=crops.position_lab_mm[frames],
+        R_lab_body=R_lab_body,
+        texture=texture,
+        blur_px=blur_px,
+        fitter=fitter,
+        fixed=crops.fixed,
+        # The error of a fixed ball's limb is the same in all pictures: together they count as one.
+        limb_share=1.0 / len(frames) if crops.fixed else 1.0,
+    )
 
 
 def iterate(state: State, settings: MapSettings, k: int) -> tuple[State, Iteration]:
