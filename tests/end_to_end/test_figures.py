@@ -45,7 +45,7 @@ def test_a_table_goes_between_its_marks_and_nowhere_else(tmp_path):
     (table,) = figures.tables_of("said\n| new | \\1 |\n|---|---|\n| 1 | 2 |\nmore\n")
     figures.insert(page, "a", table)
     assert page.read_text() == f"one\n<!-- figure a -->\n{table}\n<!-- end a -->\ntwo\n"
-    with pytest.raises(SystemExit, match="one pair of marks of figure b"):
+    with pytest.raises(RuntimeError, match="one pair of marks of figure b"):
         figures.insert(page, "b", table)
 
 
