@@ -41,7 +41,8 @@ class BallView:
         at = torch.linspace(-1.0, 1.0, SAMPLES, dtype=torch.float64)
         a, b = (part.reshape(-1) for part in torch.meshgrid(at, at, indexing="ij"))
         points = X + radius_mm * (torch.stack([a, b, torch.zeros_like(a)], dim=-1) @ R)
-        found = torch.linalg.lstsq(_terms(a, b), camera.project(points)).solution.mT
+        # The default driver, gelsy, reads memory that torch does not set: its last bits, even its rank, vary.
+        found = torch.linalg.lstsq(_terms(a, b), camera.project(points), driver="gels").solution.mT
         return cls(R_view_lab=R, distance_radii=D, place_px=found.contiguous())
 
 

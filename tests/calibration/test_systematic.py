@@ -86,7 +86,7 @@ class Ball:
         seen = self.shown(truly, pose)
         for _ in range(3):
             missed = seen - self.shown(self.rig, pose)
-            pose = pose + torch.linalg.lstsq(self.slope, missed[:, None]).solution[:, 0]
+            pose = pose + torch.linalg.lstsq(self.slope, missed[:, None], driver="gels").solution[:, 0]
         return -pose  # R_found = exp(pose) R_true
 
 

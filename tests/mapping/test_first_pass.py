@@ -88,6 +88,16 @@ def test_cells_hold_the_paint_and_its_slope_where_pictures_show_it(camera, built
     assert bool((grey[unseen] == 0).all())
 
 
+def test_a_view_does_not_depend_on_what_memory_held_before():
+    # torch's default least squares takes columns first that such memory names.
+    views, camera = set[bytes](), brown()
+    for k in range(400):
+        held = [torch.full((1 + (7 * k + n) % 300,), k % 3, dtype=torch.int32) for n in range(k % 30)]
+        views.add(BallView.of(camera, X, RADIUS_MM).place_px.numpy().tobytes())
+        del held
+    assert len(views) == 1
+
+
 def test_masked_pixels_show_nothing():
     camera, R = pinhole(), torch.eye(3, dtype=torch.float64)
     cells, view, picture = PaintCells(48, 0.05), BallView.of(pinhole(), X, RADIUS_MM), picture_of(camera, R)
