@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+import yaml
 from photographs import Stills, write_stills
 from PIL import Image
 from typer.testing import CliRunner
@@ -20,7 +21,7 @@ from sphereorient.cameras import load_cameras
 from sphereorient.cli import app
 from sphereorient.errors import CameraError, ExperimentError
 from sphereorient.experiment.recording import open_recording
-from sphereorient.locate import LocateSettings
+from sphereorient.locate import LocateSettings, known_diameter_px
 from sphereorient.locate.scene import still_ball
 from sphereorient.movies import open_movie
 from sphereorient.preflight.first_look import look_at
@@ -102,6 +103,20 @@ def test_a_ball_that_fills_most_of_the_picture_is_found(still, share):
     assert np.hypot(outline.u_px - middle[1], outline.v_px - middle[0]) < 2
     inside = background.mean[round(outline.v_px), round(outline.u_px)]
     assert abs(float(inside) - float(np.median(grey[:5]))) < 3  # of the surroundings, not of the ball
+
+
+@pytest.mark.parametrize("empty", [True, False])
+def test_the_cameras_give_the_size_in_one_picture_only_with_the_empty_scene(still, tmp_path, empty):
+    shutil.copytree(still, tmp_path / "one")
+    path = tmp_path / "one" / "experiment.yaml"
+    document = yaml.safe_load(path.read_text("utf-8"))
+    if empty:
+        cv2.imwrite(str(path.with_name("empty.png")), np.full_like(cv2.imread(str(photograph(still)), 0), 40))
+        document["backgrounds"] = {"cam1": "empty.png"}
+    path.write_text(yaml.safe_dump(document), "utf-8")
+    with open_recording(path, textured=False) as recording:
+        size_px = known_diameter_px(recording, recording.streams[0], LocateSettings())
+    assert size_px == pytest.approx(Stills(count=1, seed=5).diameter_px, rel=0.01) if empty else size_px is None
 
 
 def test_a_photograph_without_a_ball_is_one_line():
