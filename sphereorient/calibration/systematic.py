@@ -32,6 +32,7 @@ def systematic_errors(
         some = positions[torch.linspace(0, len(positions) - 1, DIRECT_FRAMES).round().long()]
     effect = _pose_by_parameters(cameras, covariance.names, some, radius_mm)
     if some is not positions:
+        # Driver: as in BallView.of; the default one is not reproducible.
         law = torch.linalg.lstsq(_quadratic(some, some), effect.flatten(1), driver="gels").solution
         effect = (_quadratic(positions, some) @ law).unflatten(1, effect.shape[1:])
     whole = position_lab_mm.new_full((len(known), 6, 6), torch.nan, dtype=torch.float64)

@@ -56,12 +56,14 @@ class CameraScene:
 
 def known_diameter_px(recording: Recording, stream: CameraStream, settings: LocateSettings) -> float | None:
     """Return the expected diameter, px; None if only the movie can show it; raises as `expected_diameter_px`."""
+    if settings.diameter_px is not None:
+        return settings.diameter_px
     experiment = recording.experiment
+    # Of one picture alone the distance is not known either.
     alone = recording.photograph and stream.name not in experiment.background_paths
-    unknown = experiment.diameter_mm is None and (recording.photograph or experiment.sphere.in_place)
-    if settings.diameter_px is None and (alone or unknown):
+    if alone or (experiment.diameter_mm is None and (recording.photograph or experiment.sphere.in_place)):
         return None
-    return settings.diameter_px or expected_diameter_px(stream.name, recording.cameras, experiment.diameter_mm)
+    return expected_diameter_px(stream.name, recording.cameras, experiment.diameter_mm)
 
 
 def find_scenes(
