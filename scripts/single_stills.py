@@ -84,6 +84,7 @@ def still(movie: Path, place: int, kind: str, number: int) -> Path:
         (picture,) = pictures.sample([place])
     cv2.imwrite(str(folder / "still" / "frame_0000.png"), np.asarray(picture))
     document |= {"movies": {"cam1": "still"}, "backgrounds": {"cam1": "empty_cam1.png"}}
+    document["response"] = "linear"  # a picture file of 8 bits without it is taken for gamma-coded
     if kind == "mirrored":
         document["flip"] = {"cam1": "horizontal"}
     if kind == "map of another ball":
