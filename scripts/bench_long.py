@@ -1,10 +1,9 @@
 """Time, rate and peak memory of `sphereorient track` over a long movie, and over its beginning.
 
-    sphereorient synth --out LONG --set frames=15000 --set image_size=[480,480] --set diameter_px=80 \
-        --set exposure_samples=1
-    scripts/bench_long.py LONG/experiment.yaml [--frames 500 15000] [--jobs 1 2]
+    scripts/bench_long.py FOLDER/experiment.yaml [--frames 500 15000] [--jobs 1 2]
 
-Each run is a process of its own, start-up included; the tracks of one length must have the same bytes.
+A movie that is not there is rendered: 15,000 frames of two cameras, 480 x 480 px, a ball of 80 px. Each run is a
+process of its own, start-up included; the tracks of one length must have the same bytes.
 """
 
 from __future__ import annotations
@@ -26,6 +25,9 @@ from experiment_file import write_experiment
 
 from sphereorient import so3
 from sphereorient.experiment import load_experiment
+from sphereorient.synth import SynthSettings, write_synthetic_experiment
+
+SCENE = SynthSettings(frames=15000, image_size=(480, 480), diameter_px=80.0, exposure_samples=1)
 
 
 def digest(path: Path) -> str:
@@ -59,6 +61,8 @@ def main() -> None:
     parser.add_argument("--frames", type=int, nargs="+", default=[500, 15000])
     parser.add_argument("--jobs", type=int, nargs="+", default=[1, 2])
     arguments = parser.parse_args()
+    if not arguments.experiment.is_file():
+        write_synthetic_experiment(arguments.experiment.parent, SCENE)
     experiment = load_experiment(arguments.experiment.resolve())
     with tempfile.TemporaryDirectory() as name:
         for frames in arguments.frames:

@@ -71,6 +71,11 @@ FIGURES: dict[str, Figure] = {
     "robustness": Figure(
         pages=("robustness.md",), command="bench_robustness.py --out out/robustness", keeps="robustness"
     ),
+    "levels": Figure(
+        pages=("robustness.md",),
+        command="sphereorient bench robustness --levels 2,4 --out out/levels",
+        keeps="levels",
+    ),
     "accuracy": Figure(
         pages=("accuracy.md",),
         command=f"accuracy.py {SHARED}/experiment {SHARED}/tank {SHARED}/gloss --benchmark out/robustness/results.json",
@@ -86,6 +91,7 @@ FIGURES: dict[str, Figure] = {
     "stills": Figure(pages=("robustness.md",), command="single_stills.py --stills 3"),
     "limits": Figure(pages=("robustness.md",), command="light_limits.py", tables=("limits",)),
     "density": Figure(pages=("robustness.md",), command="sphereorient bench balls --out out/balls", keeps="balls"),
+    "several": Figure(pages=("tracking.md", "map.md"), command=f"several_balls.py {SHARED}/swarm", tables=("several",)),
     "reliability": Figure(pages=("robustness.md",), command="reliability.py", keeps="reliability"),
     "cameras": Figure(
         pages=("accuracy.md", "errors.md"),
@@ -99,6 +105,9 @@ FIGURES: dict[str, Figure] = {
         command=f"bench_memory.py {SHARED}/experiment/experiment.yaml --times 1 5 10",
         last=True,
     ),
+    "long": Figure(
+        pages=("long-runs.md",), command="bench_long.py out/long/experiment.yaml --frames 15000 --jobs 1", last=True
+    ),
     "departures": Figure(pages=("paper-map.md",), command=f"paper_departures.py {SHARED}/experiment"),
     "backgrounds": Figure(pages=("paper-map.md",), command=f"compare_backgrounds.py {SHARED}/experiment"),
     "search": Figure(pages=("accuracy.md",), command=f"bench_search.py {SHARED}/experiment", last=True),
@@ -107,7 +116,7 @@ FIGURES: dict[str, Figure] = {
     "designs": Figure(pages=("proposer.md",), command="proposer_designs.py --minutes 5", tables=("designs",)),
     "learnt-path": Figure(pages=("assembly.md",), command="learn_path.py"),
     "learnt-path-honest": Figure(pages=("assembly.md",), command="learn_path.py --honest"),
-    "maps": Figure(pages=("map.md",), command="map_accuracy.py", tables=("maps", "fictrac")),
+    "maps": Figure(pages=("map.md",), command="map_accuracy.py", tables=("maps", "fictrac", "old")),
     "map-figures": Figure(pages=("map.md",), command="figure_map.py"),
     "photographs": Figure(
         pages=("map.md",),
@@ -117,6 +126,11 @@ FIGURES: dict[str, Figure] = {
     "fly": Figure(pages=("map.md",), command="real_fictrac.py"),
     "fictrac-axes": Figure(pages=("fictrac.md",), command="fictrac_axes.py"),
     "scenes": Figure(pages=("fictrac.md",), command="sphereorient bench ball --out out/ball", keeps="ball"),
+    "minute": Figure(
+        pages=("fictrac.md",),
+        command="sphereorient bench ball --scenes clean_fly,noisy --frames 6000 --out out/minute",
+        keeps="minute",
+    ),
     "dots": Figure(pages=("photographs.md",), command="real_spindoe.py"),
     "moon": Figure(pages=("moon.md",), command=f"moon.py {SHARED}/real/moon", tables=("moon",)),
     "statistics": Figure(pages=("statistics.md",), command="ensemble_coverage.py"),

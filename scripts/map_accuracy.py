@@ -6,7 +6,7 @@ Movies: two synthetic ones of other paints, rendered here; and, where they are t
 cam1 alone, and the fixed ball. `sphereorient map` learns each map and `sphereorient track` tracks with it, in processes
 of their own, one thread. The map is compared with the exact one by the shared score_map.py, or, if that is not there,
 by our `compare_maps`. Prints one Markdown table; after the row of the fixed ball a second one, with FicTrac's result on
-the same movie beside ours.
+the same movie beside ours; then a third one, of the shared experiment with a warped map, corrected by `map --init`.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ import h5py
 import numpy as np
 import torch
 from experiment_file import write_experiment
+from figure_map import warped
 from torch import Tensor
 
 from sphereorient import so3
 from sphereorient.errors import PaintError
 from sphereorient.experiment import load_experiment
-from sphereorient.report.texture_map import shares_seen
+from sphereorient.report.texture_map import shares_seen, write_texture
 from sphereorient.sphere import load_texture, read_seen, seen_path
 from sphereorient.sphere.compare import compare_maps
 from sphereorient.synth import SynthSettings
@@ -56,6 +57,7 @@ COLUMNS = (
     "texture displaced, rms / median",
     "`map`: CPU s, per frame, GB",
 )
+OLD, OLD_COLUMNS = "old", ("map", "texture displaced, rms / median", "orientation, median / 95 %")
 BESIDE = ("program", "absolute error, median / 95 %", "step error, median", "CPU s per frame", "memory, GB")
 # Its q_factor, and CPU s per frame on movies of this kind, measured on the same kind of machine (shared
 # docs/ANCHORS.md, 2.1); its memory was not.
@@ -123,7 +125,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--shared", type=Path, default=SHARED)
     parser.add_argument("--work", type=Path, help="keep all files here")
-    parser.add_argument("--only", nargs="+", help="these rows only, e.g. synth_dots experiment")
+    parser.add_argument("--only", nargs="+", help="these movies only, e.g. synth_dots experiment; old: the third table")
     parser.add_argument("--set", action="append", default=[], dest="overrides")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -142,6 +144,9 @@ def main() -> None:
             print(row_text(row, options.shared / "score_map.py"), flush=True)
             if case.both:
                 print("\n" + beside_fictrac(row) + "\n", flush=True)
+        old = case_of("experiment", work, options.shared)
+        if old is not None and (not options.only or OLD in options.only):
+            print("\n" + corrected(old, work, options.shared / "score_map.py"), flush=True)
 
 
 def case_of(name: str, work: Path, shared: Path) -> Case | None:
@@ -189,6 +194,24 @@ def row_text(row: Row, yardstick: Path) -> str:
         ", ".join([f"{row.learning.cpu_s:.0f}", *row.learning.words(frames)]),
     ]
     return "| " + " | ".join(cells) + " |"
+
+
+def corrected(case: Case, work: Path, yardstick: Path) -> str:
+    """Return the table of a warped map, the map that `map --init` makes of it, and the exact one."""
+    exact = load_experiment(case.experiment).texture_path
+    maps = {"warped": work / "warped.png", "corrected by `map --init`": work / "corrected.png", "exact": exact}
+    warped_path, corrected_path, _ = maps.values()
+    write_texture(warped(load_texture(exact)), warped_path)
+    bare = withheld(case.experiment, None, work / "old_bare.yaml")
+    run("map", bare, corrected_path, None, ["--init", str(warped_path)])
+    R_true = truth(case.experiment.parent / "truth.h5")
+    lines = ["| " + " | ".join(OLD_COLUMNS) + " |", "|" + "---|" * len(OLD_COLUMNS)]
+    for number, (name, texture) in enumerate(maps.items()):
+        track = work / f"old_{number}.h5"
+        run("track", withheld(case.experiment, texture, work / f"old_{number}.yaml"), track, None, [])
+        off_deg = angles_deg(aligned(attitudes(track), R_true, both=False), R_true)
+        lines.append(f"| {name} | {displaced(texture, exact, yardstick)} | {percentiles(off_deg)} |")
+    return "\n".join(lines)
 
 
 def beside_fictrac(row: Row) -> str:
@@ -270,12 +293,14 @@ def displaced(texture: Path, true: Path | None, yardstick: Path) -> str:
     if true is None:
         return "no exact map"
     if yardstick.is_file():
-        words = [sys.executable, str(yardstick), str(texture), str(true), "--seen", str(seen_path(texture))]
+        words = [sys.executable, str(yardstick), str(texture), str(true)]
+        words += ["--seen", str(seen_path(texture))] if seen_path(texture).is_file() else []
         scores = json.loads(subprocess.run(words, check=True, capture_output=True, text=True).stdout)
         return f"{scores['distortion_rms_deg']:.3f} / {scores['distortion_p50_deg']:.3f}"
     seen, learnt = read_seen(seen_path(texture)), load_texture(texture)
+    known = learnt if seen is None else torch.where(seen >= OFTEN, learnt, torch.nan)
     try:
-        comparison = compare_maps(torch.where(seen >= OFTEN, learnt, torch.nan), load_texture(true))
+        comparison = compare_maps(known, load_texture(true))
     except PaintError as error:
         return str(error)
     return f"{np.rad2deg(comparison.rms_rad):.3f} / {float(torch.rad2deg(comparison.length_rad).median()):.3f}"
