@@ -1,7 +1,7 @@
 # %% [markdown]
-# # Two cameras: from a plate to a report
+# # Two cameras: from a plate to a track
 #
-# A ball is filmed by two cameras. First the cameras are calibrated, then the ball is tracked, then a report is made.
+# A ball is filmed by two cameras. First the cameras are calibrated, then the ball is tracked, then its track is saved.
 # Everything here is rendered, so that the truth is known; the same commands work for your movies.
 
 # %%
@@ -83,9 +83,10 @@ print(f"orientation: median {p50:.3f} degrees, 95 % {p95:.3f}; stated {np.median
 assert p50 < 0.1
 
 # %% [markdown]
-# ## Report
+# ## Save it
 #
-# One page with statistics, error bars and figures, as `sphereorient report` writes it.
+# `sphereorient report track.h5 --experiment experiment.yaml --out report` makes a page of it, with figures. Statistics
+# need segments of at least 50 frames.
 
 # %%
 track.save(folder / "track.h5")
