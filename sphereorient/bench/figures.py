@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sphereorient.bench.results import Results, ResultSummary, summaries
-from sphereorient.bench.scenes import CLEAN, TOGETHER
+from sphereorient.bench.scenes import CLEAN
 from sphereorient.report.plots.style import new_figure, plain_logarithms
 from sphereorient.report.tables import write_csv
 from sphereorient.synth.severities import DEGRADATIONS
@@ -22,9 +22,11 @@ LEAST_DEG, MOST_DEG = 3e-3, 180.0
 
 
 def robustness_figure(results: Results) -> Figure:
-    """Draw errors and bad frames (above 10 degrees, or lost) against severity, a panel per degradation."""
+    """Draw errors and bad frames (above 10 degrees, or lost) against severity, a panel per degradation; without any,
+    those of the clean scenes.
+    """
     lines = summaries(results)
-    kinds = worst_first(lines, results.methods)
+    kinds = worst_first(lines, results.methods) or [CLEAN]
     rows = math.ceil(len(kinds) / COLUMNS)
     figure = new_figure(COLUMNS * PANEL[0], rows * PANEL[1] + 0.6)
     parts = np.ravel(figure.subfigures(rows, COLUMNS, squeeze=False))
@@ -114,14 +116,14 @@ def density_figure(runs: Sequence[Results]) -> Figure:
 
 def level_labels(kind: str, levels: Sequence[int]) -> list[str]:
     """Return the values of a degradation at some levels as text."""
-    if kind == TOGETHER:
+    if kind not in DEGRADATIONS:
         return [str(level) for level in levels]
     return [f"{DEGRADATIONS[kind].values[level - 1]:g}" for level in levels]
 
 
 def unit_of(kind: str) -> str:
     """Return the unit of a degradation's values."""
-    return "severity of each" if kind == TOGETHER else DEGRADATIONS[kind].unit
+    return DEGRADATIONS[kind].unit if kind in DEGRADATIONS else "severity of each"
 
 
 def write_table(runs: Sequence[Results], path: Path) -> None:

@@ -8,12 +8,12 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from sphereorient.errors import BenchError, TrackError, refusal
 from sphereorient.files.hdf5 import UNNAMED, ball_groups
 from sphereorient.statistics.behaviour import Behaviour, Reference, behaviour_of
+from sphereorient.statistics.segments import TRANSLATION
 from sphereorient.trajectory import Tracks, Trajectory
 from sphereorient.trajectory.datasets import nearest_rows
 from sphereorient.trajectory.rotations import distance_deg, rotation_vectors, rotations
@@ -24,7 +24,7 @@ Frames = NDArray[np.int64]
 RATES = ("velocity", "acceleration", "omega_lab", "omega_body", "alpha_lab", "alpha_body")
 ALIGNMENTS = ("none", "body", "both")
 AXES = 3
-ITERATIONS, CONVERGED = 200, 1e-12  # of the alignment
+ITERATIONS, CONVERGED = 5000, 1e-12  # of the alignment
 STILL_MM = 1e-6  # a true position that moves less is fixed
 FICTRAC_COLUMNS = 23  # at least
 DO = "pass the truth.h5 of this synthetic experiment"
@@ -75,6 +75,7 @@ def _percentiles(values: Floats) -> Floats:
 def score_track(track: Trajectory, truth_path: str | Path, align: str = "none") -> Score:
     """Compare a track with the truth (docs/data-format.md) by time to half a frame; raise TrackError on a mismatch.
     `align`: "none", or "body": first rotate the body axes of the truth to those of the track, by a constant rotation.
+    Lengths of a track in radii are not compared.
     """
     truth = _read_truth(truth_path, "position", sphere=track.sphere, also=RATES)
     row = _rows(truth["time"], track.time, truth_path)
@@ -83,13 +84,15 @@ def score_track(track: Trajectory, truth_path: str | Path, align: str = "none") 
         truth["orientation"] = truth["orientation"] @ turn
         truth |= {key: truth[key] @ turn for key in RATES if key in truth and key.endswith("_body")}
     relative, coverage = {}, {}
-    for key in (rate for rate in RATES if rate in truth):
+    known_mm = track.length_unit == "mm"
+    for key in (rate for rate in RATES if rate in truth and (known_mm or rate not in TRANSLATION)):
         measured, true = getattr(track, key), truth[key][row]
         have = np.isfinite(measured).all(axis=1)
         coverage[key] = float(have.mean())
         wrong, whole = (np.square(x[have]).sum() for x in (measured - true, true))
         relative[key] = float(np.sqrt(wrong / whole)) if have.any() else np.nan
-    R_true, off_mm = truth["orientation"][row], truth["position"][row] - track.position
+    R_true = truth["orientation"][row]
+    off_mm = truth["position"][row] - (track.position if known_mm else np.nan)
     off_rad = rotation_vectors(R_true @ track.orientation.transpose(0, 2, 1))
     return Score(
         frames=len(track),
@@ -206,7 +209,8 @@ def reference_of(path: Path, track: Trajectory) -> Reference:
     if path.suffix.lower() == ".dat":
         frame, orientation, begins = read_fictrac(path)
         row, there = nearest_rows(frame.astype(np.float64), track.time * track.frame_rate)
-        R[there], start[there] = orientation[row[there]], begins[row[there]]
+        R[there] = orientation[row[there]]
+        start[there] = np.diff(np.cumsum(begins)[row[there]], prepend=0) > 0  # also starts between these rows
     elif not _is_track(path):
         truth = _read_truth(path, "position", sphere=track.sphere)
         held = bool(np.ptp(truth["position"], axis=0).max() < STILL_MM)
@@ -223,8 +227,12 @@ def reference_of(path: Path, track: Trajectory) -> Reference:
 
 
 def against(reference: Reference, track: Trajectory, align: str = "none") -> tuple[Floats, Behaviour]:
-    """Return errors of orientation (N,), degrees, as `aligned_errors_deg`, and behaviour of a track."""
-    errors_deg = aligned_errors_deg(track.orientation, reference.R_lab_body, align)
+    """Return errors of orientation (N,), degrees, as `aligned_errors_deg` between new starts of the reference, and
+    behaviour of a track.
+    """
+    begins = np.flatnonzero(np.zeros(len(track), bool) if reference.start is None else reference.start)
+    parts = zip(np.split(track.orientation, begins), np.split(reference.R_lab_body, begins), strict=True)
+    errors_deg = np.concatenate([aligned_errors_deg(R, R_true, align) for R, R_true in parts])
     return errors_deg, behaviour_of(track, reference, align == "both")
 
 
@@ -294,16 +302,18 @@ def _alignment(measured: Floats, true: Floats, align: str) -> tuple[Floats, Floa
     left = right = np.eye(3)
     if align == "none":
         return left, right
-    right = measured[0].T @ true[0]
-    for _ in range(ITERATIONS if align == "both" else 1):
+    right, products = measured[0].T @ true[0], np.einsum("nim,njl->ijlm", true, measured)
+    for _ in range(ITERATIONS if align == "both" else 1):  # short tracks about one axis converge slowly
         if align == "both":
-            left = _mean(true @ (measured @ right).mT)
-        before, right = right, _mean((left @ measured).mT @ true)
+            left = _nearest(np.einsum("ijlm,lm->ij", products, right))
+        before, right = right, _nearest(np.einsum("ijlm,ij->lm", products, left))
         if np.abs(right - before).max() < CONVERGED:
             break
     return left, right
 
 
-def _mean(R: Floats) -> Floats:
-    """Return the rotation with the least squared chords to rotations (N, 3, 3)."""
-    return np.asarray(Rotation.from_matrix(R).mean().as_matrix(), np.float64)
+def _nearest(matrix: Floats) -> Floats:
+    """Return the rotation nearest to a sum of rotations (3, 3): that of the least squared chords to them."""
+    U, _, Vt = np.linalg.svd(matrix)
+    U[:, 2] *= np.linalg.det(U @ Vt)
+    return np.asarray(U @ Vt, np.float64)

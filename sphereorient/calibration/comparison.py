@@ -234,9 +234,9 @@ def likely_causes(compare: Comparison, found: Tensor) -> Iterator[Cause]:
     words = f"the pictures fit sphere.diameter {{:.4g}}, not {mm:.4g}: measure it, or check the calibration's lengths"
     yield fitted(lambda p: compare(sights, larger=float(p[0])), 1, words, lambda p: [mm * math.exp(p[0])])
     for some in [each, *([k] for k in each)]:
-        words = f"pixels of {' and '.join(names[k] for k in some)} {{:+.1f}} % wider than calibrated: check sx, "
-        words += "pixel_pitch, and whether the movie was resized"
-        wide = fitted(partial(_wide, compare, some), 1, words, lambda p: [100 * p[0]])
+        words = f"pictures of {' and '.join(names[k] for k in some)} {{:+.1f}} % wider than calibrated: check sx "
+        words += "({:+.1f} %), pixel_pitch along u ({:+.1f} %), and whether the movie was resized"
+        wide = fitted(partial(_wide, compare, some), 1, words, _widths)
         yield replace(wide, cameras=tuple(some))
     for k, name in enumerate(names):
         for count, moved in ((3, ""), (6, " and moved by {:.2g} mm")):
@@ -251,8 +251,14 @@ def _turn_and_move(p: Floats) -> list[float]:
     return [math.degrees(float(np.linalg.norm(p[:3]))), 100 * float(np.linalg.norm(p[3:]))]
 
 
+def _widths(p: Floats) -> list[float]:
+    """Return the relative changes of width, sx and pixel_pitch along u, per cent, of the parameter of `_wide`."""
+    wider = 1 + float(p[0])
+    return [100 * (wider - 1), 100 * (wider - 1), 100 * (1 / wider - 1)]
+
+
 def _wide(compare: Comparison, some: Sequence[int], p: Floats) -> Tensor:
-    """Return differences with pixels wider than high; the outline's circle is larger by half of that."""
+    """Return differences with pictures wider by p[0]; the outline's circle is larger by half of that."""
     pixels, larger = compare.centre_px.clone(), torch.zeros(len(compare.names), dtype=torch.float64)
     for k in some:
         middle = 0.5 * (compare.cameras[k].image_size[0] - 1)

@@ -15,7 +15,7 @@ from torch import Tensor
 from sphereorient import so3
 from sphereorient.calibration.targets import FIDUCIALS, CalibrationTarget, DotPlate, missing_keys, plate_from_entry
 from sphereorient.cameras import Port
-from sphereorient.cameras.checks import camera_error, check_known, check_rotation, named
+from sphereorient.cameras.checks import camera_error, check_camera_names, check_known, check_rotation, named
 from sphereorient.cameras.io.cameras_yaml import Entry, PortEntry
 from sphereorient.cameras.parameters import PORT_NUMBERS, PORT_TILT
 from sphereorient.errors import CameraError
@@ -105,6 +105,7 @@ def load_calibration(path: Path | str) -> CalibrationDocument:
     if not isinstance(plate, DotPlate) and any(picture.clicked_px is not None for picture in pictures):
         raise camera_error(f"{path}, clicked", "a plate with fiducials, of type dots", "another one", "remove the key")
     cameras = tuple(dict.fromkeys([*(picture.camera for picture in pictures), *keys.points]))
+    check_camera_names(cameras, f"{path}, {'pictures' if keys.pictures else 'points'}")
     return CalibrationDocument(
         path=path,
         keys=keys,

@@ -44,7 +44,7 @@ class Repaired:
     held: tuple[str, ...]  # parameters not determined by the sphere; the prior keeps them near their old values
     gap_before_mm: float  # rms distance between the lines of sight to the sphere's centre
     gap_after_mm: float
-    frames: int
+    frames: int  # with the sphere's orientation by two or more cameras
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,7 +112,7 @@ def self_calibrate(seen: Seen) -> Repaired:
     first, *others = [*agree, *(k for k in range(len(names)) if k not in agree)]
     repaired, R_lab_body = dict(seen.cameras), seen.R_lab_body.clone()
     moved, sigma, held = {}, {}, [f"{names[first]}: all (the lab frame)"]
-    before, after = [], []
+    before, after, frames = [], [], []
     for place, k in enumerate(others):
         name, camera = names[k], seen.cameras[names[k]]
         pair = _Pair(replace(seen, cameras=repaired, R_lab_body=R_lab_body), [first, *others[:place]], k)
@@ -124,6 +124,7 @@ def self_calibrate(seen: Seen) -> Repaired:
         held += [f"{name}.{part}" for part, loose in zip(MOVED, spread > HELD_SHARE * PRIOR, strict=True) if loose]
         before.append(pair.gaps(torch.zeros(6, dtype=torch.float64)))
         after.append(pair.gaps(change))
+        frames.append(pair.frames)
         if camera.covariance is not None:
             repaired[name] = _with_spread(repaired[name], camera.covariance, spread)
     return Repaired(
@@ -133,7 +134,7 @@ def self_calibrate(seen: Seen) -> Repaired:
         held=tuple(held),
         gap_before_mm=float(torch.cat(before).square().mean().sqrt()),
         gap_after_mm=float(torch.cat(after).square().mean().sqrt()),
-        frames=sum(len(gaps) for gaps in after),
+        frames=int(torch.stack(frames).any(0).sum()),
     )
 
 
@@ -144,8 +145,10 @@ class _Pair:
         cameras, pixels = list(seen.cameras.values()), seen.centre_px
         known = torch.isfinite(pixels).all(-1) & torch.isfinite(seen.R_lab_body).flatten(2).all(-1)
         each = {k: known[:, k] & known[:, loose] for k in still}
-        if (count := sum(int(both.sum()) for both in each.values())) < FRAMES_MIN:
-            expected = f"{FRAMES_MIN} frames or more in which both cameras measure the ball's orientation"
+        self.frames = torch.stack([*each.values()]).any(0)  # (N,) bool, of the track
+        if (count := int(self.frames.sum())) < FRAMES_MIN:
+            both = f"{list(seen.cameras)[loose]} and another camera"
+            expected = f"{FRAMES_MIN} frames or more in which {both} measure the ball's orientation"
             do = "pass a longer track, made with both cameras"
             raise camera_error("track", expected, f"{count}", do)
         self.loose = cameras[loose]
@@ -232,13 +235,14 @@ def check_lines(checks: Sequence[CameraCheck]) -> list[str]:
 def contradiction_lines(track: Trajectory) -> list[str]:
     """Return advice if the cameras disagree on the sphere's position in most of a movie; else an empty list."""
     reasons = [camera.reason for camera in track.cameras.values()]
-    seen = sum(all(why in OBSERVED for why in frame) for frame in zip(*reasons, strict=True))
-    contrary = sum(Reason.CONTRADICTS in frame for frame in zip(*reasons, strict=True))
-    if len(reasons) < 2 or contrary <= CONTRARY_SHARE * seen:
+    seen = [frame for frame in zip(*reasons, strict=True) if sum(why in OBSERVED for why in frame) > 1]
+    contrary = sum(Reason.CONTRADICTS in frame for frame in seen)
+    if contrary <= CONTRARY_SHARE * len(seen):
         return []
+    both = "both" if len(reasons) == 2 else "two or more"
     return [
-        f"The cameras contradict each other in {contrary} of the {seen} frames in which both see the sphere: one has "
-        "moved since its calibration, cameras.yaml is of another set-up, or a movie has lost or doubled frames.",
+        f"The cameras contradict each other in {contrary} of the {len(seen)} frames in which {both} see the sphere: "
+        "one has moved since its calibration, cameras.yaml is of another set-up, or a movie lost or doubled frames.",
         "Find out: sphereorient check EXPERIMENT reports movies that are out of step. If they are not, repair the "
         "cameras: sphereorient calibrate CAMERAS.yaml --refine-with TRACK.h5 --out REPAIRED.yaml, name REPAIRED.yaml "
         "in experiment.yaml, and track again. If that does not help, take new pictures of the plate.",

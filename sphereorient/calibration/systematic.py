@@ -32,8 +32,8 @@ def systematic_errors(
         some = positions[torch.linspace(0, len(positions) - 1, DIRECT_FRAMES).round().long()]
     effect = _pose_by_parameters(cameras, covariance.names, some, radius_mm)
     if some is not positions:
-        # Driver: as in BallView.of; the default one is not reproducible.
-        law = torch.linalg.lstsq(_quadratic(some, some), effect.flatten(1), driver="gels").solution
+        # Positions in a plane leave terms of the quadratic open; this driver allows that, and it is reproducible.
+        law = torch.linalg.lstsq(_quadratic(some, some), effect.flatten(1), driver="gelsd").solution
         effect = (_quadratic(positions, some) @ law).unflatten(1, effect.shape[1:])
     whole = position_lab_mm.new_full((len(known), 6, 6), torch.nan, dtype=torch.float64)
     whole[known] = effect @ covariance.matrix @ effect.mT
@@ -54,8 +54,8 @@ def _pose_by_parameters(
     information = positions.new_zeros(len(positions), 6, 6)
     pull = positions.new_zeros(len(positions), 6, len(names))
     for name, camera in cameras.items():
-        own = [k for k, label in enumerate(names) if label.partition(".")[0] == name]
-        by_pose, by_parameter = _slopes(camera, [names[k].partition(".")[2] for k in own], positions, radius_mm)
+        own = [k for k, label in enumerate(names) if label.rpartition(".")[0] == name]
+        by_pose, by_parameter = _slopes(camera, [names[k].rpartition(".")[2] for k in own], positions, radius_mm)
         information += by_pose.mT @ by_pose
         # The picture is fixed: the pose cancels the effect of the parameters.
         pull[:, :, own] -= by_pose.mT @ by_parameter

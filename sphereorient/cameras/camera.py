@@ -62,7 +62,7 @@ class ParameterCovariance:
     def of(self, cameras: Iterable[str]) -> "ParameterCovariance | None":
         """Return the block of some of the cameras, for names like cam1.f; None without parameters of them."""
         wanted = set(cameras)
-        kept = [k for k, name in enumerate(self.names) if name.partition(".")[0] in wanted]
+        kept = [k for k, name in enumerate(self.names) if name.rpartition(".")[0] in wanted]
         if not kept:
             return None
         return ParameterCovariance(names=tuple(self.names[k] for k in kept), matrix=self.matrix[kept][:, kept])

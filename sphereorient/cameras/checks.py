@@ -49,6 +49,13 @@ def check_rotation(name: str, R: Tensor, most: float = ROTATION_TOLERANCE, do: s
         raise camera_error(name, expected, f"|R R^T - I| = {error:.2g}, det = {det:.6g}", do)
 
 
+def check_camera_names(names: Iterable[str], where: str) -> None:
+    """Refuse names that cannot be names of groups in track.h5: empty ones, '.', and names with '/' (CameraError)."""
+    for name in names:
+        if not name.strip() or "/" in name or name == ".":
+            raise camera_error(where, "names without '/'", short(name), "give each camera a name, such as cam1")
+
+
 def check_points(name: str, points: Tensor, size: int) -> None:
     """Refuse points that are not (..., size) floating-point numbers (ShapeError)."""
     check_tail(name, points, size)

@@ -334,7 +334,7 @@ def ball_scenes(given: _BallOptions) -> None:
             raise SettingsError(refusal("--scenes", expected=expected, got=got, do="choose some of these"))
     rows = []
     for name in names:
-        done = given.out / f"{name}-{given.frames}-{given.seed}.json"
+        done = given.out / f"{name}-{given.frames}-{given.seed}{'-first' if given.first else ''}.json"
         if not done.exists():
             folder = done.with_suffix("")
             with progress_bar(given.quiet) as advance, writing(force=True):  # of this run

@@ -50,7 +50,7 @@ def map_(given: _MapOptions) -> None:
     from sphereorient.experiment import load_experiment
     from sphereorient.methods.map import learn_map
     from sphereorient.run.store import FolderStore, Request
-    from sphereorient.sphere import load_texture
+    from sphereorient.sphere import load_known
 
     outs = {name: file_of(given.out, name) for name in load_experiment(given.experiment).names}
     for one in outs.values():
@@ -58,7 +58,7 @@ def map_(given: _MapOptions) -> None:
             check_writable(path)
     also = ["paint.unordered=true"] if given.photographs else []
     chosen, begun = given.chosen("map", *also), time.perf_counter()
-    old = None if given.init is None else load_texture(given.init)
+    old = None if given.init is None else load_known(given.init)
     request = Request(experiment=given.experiment, out=given.out, method="map", settings=chosen, cameras=given.names)
     store = FolderStore(request.parts)
     with store.held(request, resume=given.resume), progress_bar(given.quiet, unit="iterations") as advance:
@@ -119,9 +119,10 @@ def _write(result: "MapResult", old: "Tensor | None", out: Path) -> list[Path]:
 
 
 def _print(result: "MapResult") -> None:
+    from sphereorient.report.frame_warnings import frame_numbers
     from sphereorient.report.texture_map import shares_seen
 
-    learnt = result.learnt
+    learnt, numbers = result.learnt, frame_numbers(result.track)
     seen, often = shares_seen(learnt.seen, (1, OFTEN))
     closure, last = learnt.closure, learnt.rounds[-1]
     before, after = (math.degrees(drift) for drift in (closure.drift_before_rad, closure.drift_after_rad))
@@ -135,7 +136,7 @@ def _print(result: "MapResult") -> None:
     ]
     alone = ~learnt.valid & learnt.position_lab_mm[:, 0].isfinite()  # of photographs
     if alone.any():
-        named = ", ".join(str(k) for k in alone.nonzero()[:, 0].tolist())
+        named = ", ".join(str(k) for k in numbers[alone.numpy()].tolist())
         lines.append(f"without an orientation, because they overlap the others too little: frames {named}")
     paint = learnt.paint[learnt.paint.isfinite()]
     if len(paint):
@@ -143,7 +144,7 @@ def _print(result: "MapResult") -> None:
         said = f"paint in pictures held out of the map: correlation {middle:.3f} (median), {low:.3f} (5th percentile)"
         lines.append(said if middle > PAINT_MIN else f"doubt: {said}; do not trust the map")
     if len(learnt.jumps):
-        named = ", ".join(str(k) for k in learnt.jumps[:PLACES_PRINTED].tolist())
+        named = ", ".join(str(k) for k in numbers[learnt.jumps[:PLACES_PRINTED].numpy()].tolist())
         lines.append(f"doubt: the angular velocity jumps at {len(learnt.jumps)} frames: {named}")
     echo_lines(lines)
 
@@ -178,9 +179,10 @@ def compare_maps_(
 def _compare_two(maps: list[Path], out: Path | None, *, turned: bool, as_json: bool) -> None:
     from sphereorient.report import texture_map
     from sphereorient.report.plots.style import write_figure
+    from sphereorient.sphere import load_known
     from sphereorient.sphere.compare import CHANGED, compare_maps, texture_change, turned_map, without_changed
 
-    after, before = (_known_map(path) for path in maps)
+    after, before = (load_known(path) for path in maps)
     comparison = compare_maps(after, before, turned=turned)
     R = comparison.R_other_reference
     change = texture_change(turned_map(after, R, len(before)), before)
@@ -202,9 +204,10 @@ def _compare_two(maps: list[Path], out: Path | None, *, turned: bool, as_json: b
 
 def _compare_series(maps: list[Path], out: Path | None, *, turned: bool, as_json: bool) -> None:
     from sphereorient.report.plots.style import write_figure
+    from sphereorient.sphere import load_known
     from sphereorient.tools.wear import wear_figure, wear_series
 
-    known = [_known_map(path) for path in maps]
+    known = [load_known(path) for path in maps]
     found = wear_series(known, turned)
     stems = [path.stem for path in maps]
     names = stems if len(set(stems)) == len(stems) else [str(path) for path in maps]
@@ -280,11 +283,3 @@ def _numbers(comparison: "MapComparison") -> dict[str, object]:
         "moved_max_deg": math.degrees(comparison.max_rad),
         "correlation": comparison.correlation,
     }
-
-
-def _known_map(path: Path) -> "Tensor":
-    """Read a map; NaN: unseen paint."""
-    from sphereorient.sphere import load_texture, load_unseen
-
-    texture, unseen = load_texture(path), load_unseen(path)
-    return texture if unseen is None else texture.masked_fill(unseen, math.nan)

@@ -43,7 +43,7 @@ class _SpinOptions:
     texture: Annotated[Path, Option(help="Table of dots .csv (x,y,z a line), or a texture map .png.")]
     out: Annotated[Path, Option("--out", "-o", help="Result to write, .json; a figure .png goes beside it.")]
     dot_radius: Annotated[float | None, Option(help="Radius of the dots on the ball, degrees; else measured.")] = None
-    omega_max: Annotated[float, Option(min=1e-3, help="Fastest spin, rad/s.")] = 2 * math.pi * 300
+    omega_max: Annotated[float, Option(min=1e-3, max=1e6, help="Fastest spin, rad/s.")] = 2 * math.pi * 300
     quiet: Quiet = False
 
 

@@ -92,11 +92,15 @@ def _with_map(path: Path, given: _TrackOptions, settings: "Settings") -> "Path |
         return path
     if given.method != "precise" or given.learnt is not None or not experiment.mapless:
         return path
-    from sphereorient.files.whole_file import writing
+    from sphereorient.experiment.experiment import MAP
+    from sphereorient.files.whole_file import has_mark, writing
     from sphereorient.methods.map import first_map_of
     from sphereorient.report.texture_map import write_map
     from sphereorient.sphere import unseen_share
 
+    beside = experiment.folder / MAP
+    if given.resume and experiment.texture_path is None and has_mark(beside):  # learnt by the interrupted run
+        return experiment.with_sphere(texture_path=beside)
     target = experiment.new_map_path()
     check_writable(target)
     with progress_bar(given.quiet) as advance:
@@ -212,10 +216,11 @@ def live(given: _LiveOptions) -> None:
     chosen, experiment = given.chosen("precise"), load_experiment(given.experiment)
     source, page, movies = source_of(given.source, _log), None, _movies_of(given, experiment)
     with ExitStack() as opened:
-        outputs = [open_output(name, _log) for name in given.to or ()]
+        outputs = []
         opened.callback(source.close)
-        for output, _ in outputs:
-            opened.callback(output.close)
+        for name in given.to or ():
+            outputs.append(open_output(name, _log))
+            opened.callback(outputs[-1][0].close)
         if len(experiment.names) > 1 and any(form != "json" for _, form in outputs):
             got, do = ", ".join(given.to or ()), "name zmq:PORT or NAME.jsonl: other outputs do not name the ball"
             raise SettingsError(refusal("--to", expected="JSON for several balls", got=got, do=do))

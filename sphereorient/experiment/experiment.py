@@ -322,7 +322,8 @@ def response_of(where: str, given: Any) -> Response:
         if isinstance(given, dict) and given.keys() == {"gamma"} and 0.1 <= float(given["gamma"]) <= 10.0:
             return Response(gamma=float(given["gamma"]))
         table = np.array(given, np.float64)
-        if table.shape == (len(table), 2) and not table[0].any() and bool((np.diff(table, axis=0) > 0).all()):
+        increasing = len(table) > 1 and bool((np.diff(table, axis=0) > 0).all()) and np.isfinite(table).all()
+        if table.shape == (len(table), 2) and not table[0].any() and increasing:
             return Response(table=tuple(map(tuple, table / table[-1])))
     expected = "linear, srgb, {gamma: NUMBER}, or a table [[0, 0], ...] of grey level and light, both increasing"
     raise input_error(where, expected, short(given), "write one of these, or remove the key: it is then learnt")

@@ -1,5 +1,6 @@
 """Times of an experiment's frames, and the picture of each movie at each frame."""
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -73,10 +74,12 @@ def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     Times come from the frame rate, a table, or stamps of the movies; equal stamps of several cameras make one frame. A
     remark is added for a rate implausible for cameras, and for a frame rate that contradicts a movie's stamps.
 
-    Raises ExperimentError (unreadable table of times, one of another length, or times without a unit that are hardly in
-    s), MovieError (a movie without enough frames, or without time stamps for `times: movies`).
+    Raises ExperimentError (unreadable table of times, one of another length, times without a unit that are hardly in s,
+    an exposure longer than a frame), MovieError (a movie without enough frames, or without time stamps for `times:
+    movies`).
     """
     whole = _stamped(experiment, movies) if experiment.times == MOVIES_OWN else _counted(experiment, movies)
+    _check_exposure(experiment, whole)
     whole = replace(whole, remarks=(*whole.remarks, *_questioned(experiment, whole.frame_s, movies)))
     if experiment.frames is None:
         return whole
@@ -86,6 +89,15 @@ def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
         raise MovieError(refusal(f"{experiment.path}, movies", expected=expected, got=f"{len(whole)}", do=do))
     rows = {name: row[first:last] for name, row in whole.rows.items()}
     return replace(whole, number=whole.number[first:last], time_s=whole.time_s[first:last], rows=rows)
+
+
+def _check_exposure(experiment: Experiment, whole: Timeline) -> None:
+    seen_s = [np.diff(whole.time_s[row != NONE]) for row in whole.rows.values()]
+    frame_s = max((float(np.median(steps)) for steps in seen_s if len(steps)), default=math.inf)
+    if experiment.exposure_s is not None and experiment.exposure_s > frame_s * (1 + EVEN_STEPS):
+        expected = f"at most the time between frames, {frame_s:.4g} s"
+        got, do = f"{experiment.exposure_s:g}", "write it in seconds"
+        raise input_error(f"{experiment.path}, exposure", expected, got, do)
 
 
 def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:

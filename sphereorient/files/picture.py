@@ -16,6 +16,8 @@ from tifffile import TiffFile, TiffFileError
 from sphereorient.files.whole_file import put_aside
 
 TIFF_SIZE = (256, 257)  # the tags of width and height
+TIFF_BEGINS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+WHITE_IS_ZERO, SEPARATE = 0, 2  # PhotometricInterpretation, PlanarConfiguration
 EXIF, FOCAL_35MM, EXIF_SIZE = 0x8769, 0xA405, (0xA002, 0xA003)  # the block of tags, and its tags
 FILM_MM = 43.27  # diagonal of 35 mm film
 FORMATS = ("PNG", "JPEG", "BMP", "PPM", "TIFF")
@@ -78,9 +80,22 @@ def decoded(content: bytes, flags: int) -> NDArray[Any] | None:
 
 
 def decoded_grey(content: bytes) -> NDArray[Any] | None:
-    """Return the grey values of a picture file, (H, W), in its own depth; None if decoding fails."""
-    picture = decoded(content, GREY)
+    """Return the grey values of a picture file, (H, W), in its own depth; None if decoding fails or would be wrong."""
+    picture = None if _misread(content) else decoded(content, GREY)
     return None if picture is None or picture.ndim != 2 else np.asarray(picture)
+
+
+def _misread(content: bytes) -> bool:
+    """Return whether OpenCV decodes a TIFF file wrongly: deeper than 8 bit, with white as 0 or colours in planes."""
+    if content[:4] not in TIFF_BEGINS:
+        return False
+    try:
+        with TiffFile(BytesIO(content)) as file:
+            page: Any = file.pages[0]
+            planes = page.samplesperpixel > 1 and page.planarconfig == SEPARATE
+            return bool(page.dtype.itemsize > 1 and (page.photometric == WHITE_IS_ZERO or planes))
+    except FAULTS:
+        return False
 
 
 def vertical_field_deg(path: Path) -> float | None:

@@ -443,8 +443,8 @@ class BallTracker:
         seen = use & (best.score[0] > 0) & (best.score[0] >= self.score_min - HIDDEN_LESS * (1.0 - visible))
         seen &= torch.isfinite(best.covariance).all()
         reason = [
-            Reason.OK if now else Reason.LOW_SCORE if why is Reason.OK else why
-            for now, why in zip(seen.tolist(), poses.reason, strict=True)
+            Reason.OK if now else Reason.HIDDEN if covered else Reason.LOW_SCORE if why is Reason.OK else why
+            for now, covered, why in zip(seen.tolist(), (visible <= LEAST_VISIBLE).tolist(), poses.reason, strict=True)
         ]
         if bool(seen.any()) and not bool((seen == use).all()):
             fit = self._looked_at(pictures, poses, seen, ((fitter.optics.fine, 1, 4),), every)

@@ -72,14 +72,13 @@ def cameras_disagree(apart: Sequence[Poses], parts: Sequence[Sequence[int]]) -> 
         whole[:, list(own)] = arrays[name]
         arrays[name] = whole
     for other, (k, *several) in ((apart[part], parts[part]) for part in seeing):
-        if several:
-            continue  # only the first part, the agreeing cameras, has more than one
+        if several or other is main:  # the agreeing cameras, or the camera in use, have their own results
+            continue
         arrays["own_turn"][:, k] = so3.log(other.R_lab_body[:1] @ main.R_lab_body.mT)
         arrays["own_move"][:, k] = other.position_lab_mm[:1] - main.position_lab_mm
-        if other is not main:
-            reason[k] = Reason.CONTRADICTS
-            for name in OWN:
-                arrays[name][:, k] = getattr(other, name)[:1, 0]
+        reason[k] = Reason.CONTRADICTS
+        for name in OWN:
+            arrays[name][:, k] = getattr(other, name)[:1, 0]
     return Poses(**arrays, use=use, reason=tuple(reason))
 
 

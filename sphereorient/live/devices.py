@@ -27,7 +27,7 @@ WAIT_S = 0.2  # limit of one call of a driver; without a trigger it is repeated
 RELEASE_S = 10.0  # for drivers to release their cameras
 BUFFERS = 16  # pictures buffered by a driver
 OPENING = Lock()  # one camera at a time, as drivers scan for cameras
-ALIKE = 0.02  # relative rounding of settings by a device
+ALIKE = 0.02  # relative rounding of exposure and rate by a device; sizes are exact
 OLDER = {"ExposureTime": "ExposureTimeAbs", "AcquisitionFrameRate": "AcquisitionFrameRateAbs"}  # of older GigE cameras
 OPENCV = {
     "Width": cv2.CAP_PROP_FRAME_WIDTH,
@@ -259,7 +259,9 @@ def _refused(device: Device, name: str, value: Any) -> str:
 
 
 def _alike(one: Any, other: Any) -> bool:
-    return abs(one - other) <= ALIKE * abs(other) if isinstance(other, int | float) else str(one) == str(other)
+    if isinstance(other, float):
+        return bool(abs(one - other) <= ALIKE * other)
+    return bool(one == other) if isinstance(other, int) else str(one) == str(other)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -300,6 +302,9 @@ class LiveCamera:
                 if self.log is None or not seen:
                     raise
                 found = str(error)
+            if not seen and not stopped.is_set():
+                do = "end other programs that use it, or choose another camera"
+                raise MovieError(refusal(self.name, expected="pictures", got="none", do=do))
             if self.log is None or not seen:
                 return
             if not fault and not stopped.is_set():

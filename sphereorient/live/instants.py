@@ -40,6 +40,7 @@ class _Clock:
     name: str
     offset_s: float | None = None  # stamp + offset is the common time; None: not synchronised
     counter: int | None = None
+    last: int = 0  # of the finished instants, the last with a picture of it
     stamps: deque[float] = field(default_factory=lambda: deque(maxlen=SURE))
     lags: deque[float] = field(default_factory=lambda: deque(maxlen=SURE))  # arrival - stamp
 
@@ -69,7 +70,7 @@ class Instants:
         self._steps: deque[float] = deque(maxlen=32)  # between pictures of a camera
         self._open: list[_Instant] = []  # in order of time
         self._times: deque[float] = deque(maxlen=2 * JOINING)  # of finished instants
-        self._number = -1
+        self._number, self._count = -1, 0  # of the last instant, lost ones included; of finished instants
         self._lacks, self._logged, self._log_s = Counter[str](), 0, -math.inf
 
     @property
@@ -169,7 +170,11 @@ class Instants:
         )
 
     def _arrival(self, instant: _Instant) -> Arrival:
-        lost = min(instant.steps.values()) - 1  # by all
+        self._count += 1
+        # By all: an instant that another camera has was not lost.
+        lost = max(0, min(step - (self._count - self._clocks[k].last) for k, step in instant.steps.items()))
+        for camera in instant.steps:
+            self._clocks[camera].last = self._count
         for camera, clock in enumerate(self._clocks):
             missing = camera not in instant.steps and clock.offset_s is not None
             self._lacks[f"{clock.name} missing"] += lost + missing

@@ -194,7 +194,8 @@ class TrackBlocks:
     def head(self) -> Trajectory:
         """Return a track without frames, with the common attributes."""
         recording, experiment = self.recording, self.recording.experiment
-        origin = provenance(input_files(experiment, list(recording.cameras)), experiment.folder, self.command)
+        used = experiment.with_sphere(texture_path=None) if experiment.mapless else experiment  # it may be named
+        origin = provenance(input_files(used, list(recording.cameras)), experiment.folder, self.command)
         return Trajectory.empty(
             np.zeros(0),
             cameras=tuple(recording.cameras),
@@ -210,12 +211,14 @@ class TrackBlocks:
         """Return the next frames, with the missing ones before them, as a track."""
         time_s: list[float] = []
         poses: list[Poses] = []
+        lasting: list[Floats] = []  # (6, 6), of the appearance at that frame
         marks: list[tuple[int, int]] = []  # segment, flags
         cameras = len(self.recording.cameras)
         for now in frames:
             if self._last is not None and (missing := min(now.dropped, MOST_MISSING)):
                 time_s += np.linspace(self._last.time_s, now.time_s, missing + 2)[1:-1].tolist()
                 poses += [no_pose(cameras, (Reason.MISSING,) * cameras)] * missing
+                lasting += [np.zeros((6, 6))] * missing
                 marks += [(-1, 0)] * missing
             after = self._last is not None and self._last.valid and not now.dropped
             flags = 0
@@ -224,6 +227,7 @@ class TrackBlocks:
                 flags = 0 if self._last is None else int(Flag.SPIKE if after else Flag.RECOVERED)
             time_s.append(now.time_s)
             poses.append(now.poses if now.valid else no_pose(cameras, now.reason, now.poses.use))
+            lasting.append(now.lasting)
             marks.append((self._segment if now.valid else -1, flags))
             self._last = now
         table = pose_table(poses, cameras)
@@ -231,6 +235,12 @@ class TrackBlocks:
         clock = torch.tensor(time_s, dtype=torch.float64)
         (learnt,) = self.tracker.appearances.values()
         track = measured_track(self.recording.experiment, clock, table, choice, learnt)
-        track, _ = with_errors(track, self.recording, learnt.lasting, compared=False)
-        segment, more = np.array(marks, np.int64).T
-        return replace(track, segment=segment, flags=track.flags | more.astype(np.uint32))
+        track, _ = with_errors(track, self.recording, None, compared=False)
+        errors, (segment, more) = np.stack(lasting), np.array(marks, np.int64).T
+        return replace(
+            track,
+            position_cov=track.position_cov + errors[:, 3:, 3:],
+            orientation_cov=track.orientation_cov + errors[:, :3, :3],
+            segment=segment,
+            flags=track.flags | more.astype(np.uint32),
+        )

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from sphereorient.errors import ExperimentError, refusal
+from sphereorient.errors import ExperimentError, SettingsError, refusal
 from sphereorient.experiment import Experiment, load_experiment
 from sphereorient.experiment.recording import Recording, open_recording
 from sphereorient.files.threads import limited_cores, silent
@@ -41,9 +41,11 @@ def open_live(
     source: Experiment | Path, settings: Settings, cameras: Sequence[str] | None, learnt: Path | None
 ) -> Iterator[LiveSetup]:
     """Open an experiment. Without a texture map, the map of a fixed ball is learnt live. Raises SphereOrientError:
-    unusable inputs; ExperimentError: cameras contradict each other, or no map of a moving ball.
+    unusable inputs; ExperimentError: cameras contradict each other, or no map of a moving ball; SettingsError: cameras
+    in another order than the experiment's.
     """
     experiment = load_experiment(source)
+    _check_order(experiment, cameras)
     if experiment.mapless and learnt is None:
         with _learning(experiment, settings, cameras, experiment.new_map_path()) as opened:
             yield opened
@@ -58,6 +60,14 @@ def open_live(
             do = "run `sphereorient check`, or name one camera with --cameras"
             raise ExperimentError(refusal("movies", expected="cameras that agree", got="others", do=do))
         yield LiveSetup(recording=recording, tracker=OnlineTracker(follower.tracker.balls, follower.appearances))
+
+
+def _check_order(experiment: Experiment, cameras: Sequence[str] | None) -> None:
+    """Refuse cameras in another order than the movies, or named twice: devices are paired with them in that order."""
+    order = [name for name in experiment.movie_paths if name in (cameras or ())]
+    if cameras is not None and {*cameras} == {*order} and [*cameras] != order:
+        expected, do = f"the order of movies: {', '.join(order)}", "write them in this order, and devices too"
+        raise SettingsError(refusal("--cameras", expected=expected, got=", ".join(cameras), do=do))
 
 
 @contextmanager

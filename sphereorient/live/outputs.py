@@ -2,6 +2,7 @@
 and a line in `SOCKETS`, `NAMED` or `FILES`.
 """
 
+import math
 import os
 import re
 import socket
@@ -162,12 +163,16 @@ class LslOutput(Output):
         if "LSLAPICFG" not in os.environ:
             self._lsl.set_config_content("[multicast]\nResolveScope = machine\n[log]\nlevel = -2\n")
         self._apart_s: deque[float] = deque(maxlen=LEAST_OF)  # LSL's clock at the arrival, less the frame's time
+        self._before_s = -math.inf  # time of the frame before
         self._outlet: Any = None
 
     def send(self, numbers: dict[str, float]) -> None:
         """Push a sample; LSL keeps 36,000 of them for each reader."""
         self._outlet = self._outlet or self._opened(list(numbers))
         arrived_s = self._lsl.local_clock() - 1e-3 * numbers["latency_ms"]
+        if numbers["time_s"] < self._before_s:  # the source began again
+            self._apart_s.clear()
+        self._before_s = numbers["time_s"]
         self._apart_s.append(arrived_s - numbers["time_s"])
         self._outlet.push_sample(list(numbers.values()), numbers["time_s"] + min(self._apart_s))
 
@@ -362,10 +367,10 @@ class TrackOutput(FileOutput):
 
     def begin(self, blocks: TrackBlocks) -> None:
         """Begin the journal; raise OutputError if it cannot be written."""
-        self._blocks = blocks
+        self._blocks, head = blocks, journal.head(blocks.head())
         try:
             self._file = self._path.open("xb")
-            self._file.write(journal.head(blocks.head()))
+            self._file.write(head)
             self._file.flush()
         except OSError as error:
             raise OutputError(no_room(self._path, error)) from None

@@ -36,7 +36,8 @@ def movie_frames(recording: Recording, paced: bool) -> Iterator[Arrival]:
     """Yield the frames of an experiment's movies; `paced`: at the recorded times, else on demand."""
     pictures = zip(*(stream.pictures() for stream in recording.streams), strict=True)
     begun, first_s = time.perf_counter(), float(recording.timeline.time_s[0])
-    for number, (row, time_s) in enumerate(zip(pictures, recording.timeline.time_s.tolist(), strict=True)):
+    numbers, times_s = recording.timeline.number.tolist(), recording.timeline.time_s.tolist()
+    for number, row, time_s in zip(numbers, pictures, times_s, strict=True):
         if paced:
             time.sleep(max(0.0, begun + time_s - first_s - time.perf_counter()))
         shown = [picture for picture, _ in row]
@@ -57,6 +58,12 @@ def raw_frames(source: BinaryIO, streams: Sequence[CameraStream], rate_hz: float
         pictures = layout.pictures(content)
         yield Arrival(number=number, time_s=number / rate_hz, pictures=pictures, arrived_s=arrived_s)
         number += 1
+
+
+def _at_rate(pictures: Iterator[Arrival], frame_s: float) -> Iterator[Arrival]:
+    """Yield the pictures of a movie, which arrive as fast as they are decoded, at the experiment's rate."""
+    for arrival in pictures:
+        yield replace(arrival, time_s=arrival.number * frame_s, arrived_s=math.nan)
 
 
 def _devices(kind: str, where: str, log: Log) -> Source:
@@ -92,11 +99,12 @@ def _devices(kind: str, where: str, log: Log) -> Source:
                     )
                     for serial, stream in zip(serials, opened.streams, strict=True)
                 ]
-                yield from device_frames(cameras, log, stopped)
+                pictures = device_frames(cameras, log, stopped)
+                yield from _at_rate(pictures, opened.timeline.frame_s) if ends else pictures
         finally:
             released.set()
 
-    return Source(frames=frames, waits=ends, close=close)
+    return Source(frames=frames, waits=ends, even=ends, close=close)
 
 
 # By name; the functions get the text after ":".

@@ -58,7 +58,7 @@ def measure_background(pictures: NDArray[Any], empty: Levels | None = None) -> B
     Values beyond four robust sigmas are left out: the plain mean (paper, section III A) keeps 1/n of the sphere. With
     `empty` (H, W), the scene without the sphere, only the noise is measured.
     """
-    full_scale = _full_scale(pictures)
+    full_scale = full_scale_of(pictures)
     shape = pictures.shape[1:]
     mean, noise = np.empty(shape, np.float32), np.empty(shape, np.float32)
     for row in range(0, shape[0], 16):  # in strips: a float copy of all frames has four times their size
@@ -75,12 +75,22 @@ def measure_background(pictures: NDArray[Any], empty: Levels | None = None) -> B
     return Background(mean=mean, noise=noise, full_scale=full_scale)
 
 
-def _full_scale(pictures: NDArray[Any]) -> float:
+def full_scale_of(pictures: NDArray[Any]) -> float:
     """Return the grey level of a saturated pixel: 10 to 14 bit cameras use the lower bits of 16."""
     if pictures.dtype.itemsize == 1:
         return 255.0
-    brightest = int(pictures.max(initial=0))
+    return _next_scale(float(pictures.max(initial=0)))
+
+
+def _next_scale(brightest: float) -> float:
     return float(next(2**bits - 1 for bits in (10, 12, 14, 16) if brightest < 2**bits))
+
+
+def saturated(grey: NDArray[Any], background: Background) -> float:
+    """Return the share of saturated grey levels; brighter ones than the full scale show that it is larger."""
+    brightest = float(grey.max(initial=0))
+    full_scale = background.full_scale if brightest <= background.full_scale else _next_scale(brightest)
+    return float(np.mean(grey >= full_scale))
 
 
 def even_scene(background: Background, diameter_px: float) -> Background:
@@ -184,7 +194,7 @@ def dark_or_white(picture: Picture, background: Background) -> Reason | None:
     empty = background.mean[::EVERY, ::EVERY]
     if uniform(picture):
         return Reason.SATURATED if float(some[0, 0]) > 0.5 * background.full_scale else Reason.DARK
-    if np.mean(some >= background.full_scale) > max(WHITE_SHARE, 2 * float(np.mean(empty >= background.full_scale))):
+    if saturated(some, background) > max(WHITE_SHARE, 2 * saturated(empty, background)):
         return Reason.SATURATED
     lit = empty > LIT_NOISES * background.typical_noise
     if lit.mean() > LIT_SHARE and np.mean(some[lit] < DARK_LEVEL * empty[lit]) > DARK_SHARE:

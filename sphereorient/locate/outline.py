@@ -60,6 +60,7 @@ def find_blobs(difference: Levels, noise: Levels, diameter_px: float, settings: 
     small = np.minimum(small, np.float32(np.percentile(lit, 95)))
     size = diameter_px / factor
     inner, outer = (max(3, round(size * share) | 1) for share in (0.85, 1.5))
+    outer = max(outer, inner + 2)
     area_ratio = (inner / outer) ** 2
     mean_in = cv2.boxFilter(small, -1, (inner, inner), borderType=cv2.BORDER_CONSTANT)
     mean_out = cv2.boxFilter(small, -1, (outer, outer), borderType=cv2.BORDER_CONSTANT)

@@ -15,7 +15,16 @@ from sphereorient.cameras.response import Response
 from sphereorient.errors import ExperimentError, SettingsError, refusal
 from sphereorient.experiment.recording import CameraStream, Recording, given_scene
 from sphereorient.files.threads import side_by_side
-from sphereorient.locate.background import FREE, LOUD, Background, even_scene, filled, measure_background, without_ball
+from sphereorient.locate.background import (
+    FREE,
+    LOUD,
+    Background,
+    even_scene,
+    filled,
+    full_scale_of,
+    measure_background,
+    without_ball,
+)
 from sphereorient.locate.disks import cover, find_disks
 from sphereorient.locate.outline import Blob, Levels, Mask, Outline, fit_outline
 from sphereorient.locate.settings import LocateSettings
@@ -85,17 +94,24 @@ def find_scenes(
     sizes = {name: known_diameter_px(one, stream, settings) for name, one in each.items()}
     empty, background, outline = given_scene(recording.experiment, stream.name, stream.movie.frame_shape), None, None
     photograph = stream.photograph and len(each) == 1
-    in_place = photograph or all(one.experiment.sphere.in_place for one in each.values())
+    in_place = photograph or (len(each) == 1 and recording.experiment.sphere.in_place)
     if in_place and (empty is None or None in sizes.values()):
-        sways = not all(one.experiment.fixed for one in each.values())
+        sways = not recording.experiment.fixed
         fixed = partial(fixed_ball, circle=recording.experiment.circles.get(stream.name))
         find = still_ball if photograph else swaying_ball if sways else fixed
         outline, guess = find(stream.spread(settings.background_frames), settings, empty, stream.shown)
         sizes = {name: px or 2 * outline.radius_px for name, px in sizes.items()}
         background, outline = guess if empty is None else None, None if sways else outline
-    known = {name: px for name, px in sizes.items() if px is not None}  # all are known here
+    known = {name: px for name, px in sizes.items() if px is not None}
+    if len(known) < len(sizes):
+        do = "set locate.diameter_px, or give more frames"
+        raise SettingsError(
+            refusal(f"camera {stream.name}", expected="the balls' sizes in px", got="one picture", do=do)
+        )
     if background is None:
         background = learn_background(stream.spread(count), tuple(known.values()), settings, empty, stream.shown)
+    if stream.movie.full_scale is not None:  # the frames looked at may be dark
+        background = replace(background, full_scale=max(background.full_scale, stream.movie.full_scale))
     scene = CameraScene(background=background, diameter_px=0.0, response=stream.response, outline=outline)
     return {name: replace(scene, diameter_px=px) for name, px in known.items()}
 
@@ -211,7 +227,7 @@ def fixed_ball(
     scatter = np.asarray(grey.std(axis=0), np.float32)
     if shown is not None:
         scatter = np.where(shown, scatter, np.float32(0))
-    full_scale = float(np.iinfo(pictures.dtype).max)
+    full_scale = full_scale_of(pictures)
     if circle is not None:
         given = given_outline(circle)
         return given, _around(given, Background(mean=middle, noise=scatter, full_scale=full_scale, shown=shown), empty)

@@ -11,7 +11,7 @@ from scipy.ndimage import median_filter
 from torch import Tensor
 
 from sphereorient.errors import ExperimentError, Flag, Reason, ShapeError, refusal
-from sphereorient.locate.background import Background
+from sphereorient.locate.background import Background, saturated
 from sphereorient.locate.outline import Blob, Floats, Levels, Mask, Outline, find_blobs, fit_outline, window_about
 from sphereorient.locate.settings import LocateSettings
 
@@ -108,7 +108,7 @@ def ball_at(
     inside = window_about(u, v, int(0.7 * best.radius_px))
     if np.percentile(difference[inside], 90) < contrast_min:
         return None, Reason.DARK
-    if np.mean(frame[inside] >= background.full_scale) > settings.saturated_share:  # type: ignore[operator]
+    if saturated(frame[inside], background) > settings.saturated_share:
         return None, Reason.SATURATED
     return best, Reason.OK
 

@@ -219,15 +219,19 @@ def _smooth(crops: Crops, camera: int, total: Singles, share: Singles) -> Single
             np.asarray(cv2.boxFilter(one, -1, side, borderType=cv2.BORDER_CONSTANT), np.float32)
             for one in (total, share)
         )
-    level = total / np.maximum(share, LEAST * float(share.max()))
+    level = total / np.maximum(share, LEAST * (float(share.max()) or 1.0))
     return np.asarray(np.maximum(level, max(BLACKEST * float(level.max()), LEAST)), np.float32)
 
 
 def _mean_light(crops: Crops, camera: int) -> Singles:
-    """Return the local mean of all crops: the light, if paint averages out."""
-    counts = _within(crops, camera).astype(np.float32)
-    mean = np.mean([crop.grey for crop in crops.crops[camera] if crop is not None], axis=0, dtype=np.float32)
-    return _smooth(crops, camera, mean * counts, counts)
+    """Return the local mean of all crops that show the ball: the light, if paint averages out."""
+    total = share = np.zeros(_within(crops, camera).shape, np.float32)
+    seen = [(k, crop) for k, crop in enumerate(crops.crops[camera]) if crop is not None and crops.seen[k, camera]]
+    for k, crop in seen:
+        counts = _within(crops, camera, 0 if crops.fixed else k)
+        total, share = total + crop.grey * counts, share + counts
+    count = np.float32(max(len(seen), 1))
+    return _smooth(crops, camera, total / count, share / count)
 
 
 def _light(at: Adjustment, seen: _Seen, camera: int) -> Singles:

@@ -265,7 +265,8 @@ def corrected(learnt: LearntMap, old: Tensor) -> tuple[LearntMap, MapComparison,
         sigma=torch.where(known, nearest_texels(learnt.sigma, Q, height), torch.inf),
         R_lab_body=learnt.R_lab_body @ Q,
     )
-    return new, comparison, float((texel_areas(height) * ~known).sum() / texel_areas(height).sum())
+    kept = ~known & torch.isfinite(before)
+    return new, comparison, float((texel_areas(height) * kept).sum() / texel_areas(height).sum())
 
 
 def nearest_texels(values: Tensor, R_map_new: Tensor, height: int) -> Tensor:

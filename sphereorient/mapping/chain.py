@@ -132,9 +132,10 @@ def _check_one_ball(disks: Disks, R_lab_body: Tensor) -> None:
         return
     first, second = keys[:-1], keys[1:]
     start = R_lab_body[second] @ R_lab_body[first].mT
-    alone = (disks.where(slice(None), slice(k, k + 1)) for k in (0, 1))
-    one, other = (refine_pairs(own, first, second, start, ITERATIONS, EVERY).R_ji for own in alone)
-    apart, turn = float(so3.geodesic_distance(one, other).median()), float(so3.log(one).norm(dim=-1).median())
+    alone = (disks.where(slice(None), slice(k, k + 1)) for k in range(cameras))
+    one, *others = (refine_pairs(own, first, second, start, ITERATIONS, EVERY).R_ji for own in alone)
+    apart = max(float(so3.geodesic_distance(one, other).median()) for other in others)
+    turn = float(so3.log(one).norm(dim=-1).median())
     if apart > max(APART_RAD, APART_SHARE * turn):
         got = f"rotations that differ by {math.degrees(apart):.2g} of {math.degrees(turn):.2g} degrees"
         do = "check which movie belongs to which camera, and that they begin at the same instant"

@@ -99,14 +99,16 @@ class EvenLight:
         radius_px = float(view.radius_px(position_lab_mm, radius_mm))
         width, height = view.camera.image_size
         reach = int(REACH * radius_px) + 2
-        self.left, self.top = max(0, round(u) - reach), max(0, round(v) - reach)
-        self._there = np.s_[self.top : min(height, round(v) + reach + 1), self.left : min(width, round(u) + reach + 1)]
+        # At least one pixel, also of a ball beside the picture.
+        self.left, self.top = min(max(0, round(u) - reach), width - 1), min(max(0, round(v) - reach), height - 1)
+        right, down = min(width, round(u) + reach + 1), min(height, round(v) + reach + 1)
+        self._there = np.s_[self.top : max(down, self.top + 1), self.left : max(right, self.left + 1)]
         within = within_limb(view, position_lab_mm, radius_mm, self._there)
         self.counts = torch.from_numpy(within)
         self._within = within.astype(np.float32)
         self._window = (2 * int(WINDOW * radius_px) + 1,) * 2
         self._share = np.asarray(1 / np.maximum(self._mean(self._within), 1e-3), np.float32)
-        self._number = float(self._within.sum())
+        self._number = max(float(self._within.sum()), 1.0)  # 0: hidden by the mask
 
     def _mean(self, picture: NDArray[np.float32]) -> NDArray[np.float32]:
         for _ in range(2):  # nearly a Gaussian
@@ -400,7 +402,7 @@ def first_adjustment(recording: Recording, place: Crops, progress: Progress) -> 
     if count > len(found):
         found, kept = swept(recording, *_after(adjustment, coarse, recording), count, progress)
         adjustment = kept.adjusted(progress)
-    seen, shown = sum(map(supported, found)), count if place.fixed else int(place.seen.any(1).sum())
+    seen, shown = sum(map(supported, found)), count if place.fixed else int(place.seen[:count].any(1).sum())
     if seen < LEAST_FOUND * shown:
         got, do = f"{seen} of {shown} frames fit the map of earlier ones", "learn the map with `sphereorient map`"
         raise PaintError(refusal("movies", expected="a ball whose paint is seen again", got=got, do=do))

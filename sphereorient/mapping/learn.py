@@ -109,7 +109,8 @@ def fit_map(
     progress("map", len(done), len(done))
     if old is not None:
         R_now_old = compare_maps(iterations.sharp_map(state).float(), old).R_other_reference
-        state = replace(state, expected=turned_map(old.float(), R_now_old.mT, len(state.texture)))
+        prior = turned_map(old.float(), R_now_old.mT, len(state.texture))
+        state = replace(state, expected=torch.where(prior.isfinite(), prior, 0.5))  # grey where unknown
         for k in range(settings.rounds):
             progress("map, with the old one", k, 0)
             state, iteration = iterations.iterate(state, settings, least + k)

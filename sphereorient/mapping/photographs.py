@@ -69,7 +69,8 @@ class Evidence:
 
 def find_photographs(disks: Disks, finer: Disks, settings: MapSettings) -> PairwiseAttitudes:
     """Find orientations of N unordered photographs in disks, finally in `finer` ones, for the largest set only.
-    Raises PaintError (fewer than three pictures, no common patch, a sphere that does not rotate, or two spheres).
+    Raises PaintError (fewer than three pictures, no common patch, also in fine detail, a sphere that does not rotate,
+    or two spheres).
     """
     if len(disks) < FEWEST:
         do = "take more pictures of the ball, from all sides"
@@ -81,6 +82,10 @@ def find_photographs(disks: Disks, finer: Disks, settings: MapSettings) -> Pairw
     fine = measured_evidence(finer, settings)
     for _ in range(2):  # compare in fine detail, each time from the joint orientations
         rows, R, pairs = _settled(fine, rows, R)
+    if len(rows) < FEWEST:
+        do = "take sharper or less noisy pictures, or raise paint.detail"
+        expected, got = f"{FEWEST} that agree in fine detail", f"{len(rows) if len(rows) > 1 else 'none'}"
+        raise PaintError(refusal("photographs", expected=expected, got=got, do=do))
     before, after = (so3.nearest_rotation(attitudes[rows] @ attitudes[rows[0]].mT) for attitudes in (joined_R, R))
     place = torch.full((len(R),), -1).index_put((rows,), torch.arange(len(rows)))
     own = replace(pairs, first=place[pairs.first], second=place[pairs.second])

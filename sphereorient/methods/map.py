@@ -22,7 +22,7 @@ from sphereorient.mapping.first_pass import first_adjustment
 from sphereorient.methods.method import one_thread
 from sphereorient.methods.results import map_track
 from sphereorient.methods.settings import Settings, check_settings, settings_yaml
-from sphereorient.sphere import load_texture
+from sphereorient.sphere import load_known
 from sphereorient.sphere.compare import MapComparison
 from sphereorient.trajectory import Trajectory
 
@@ -68,7 +68,8 @@ def learn_map(
     Args:
         experiment: as loaded, or the path of its experiment.yaml.
         settings: uses the branches `paint` and `locate`; None: the defaults.
-        init: an old map (H, 2 H) of one sphere, or its file: defines the body frame, and fills unseen paint.
+        init: an old map (H, 2 H) of one sphere, NaN where unknown, or its file: defines the body frame, and fills
+            unseen paint.
         cameras: names of the cameras to use; None: all.
         progress: called with stage, steps done, and all steps.
         kept: file of an unfinished map, from which an interrupted run continues; `spheres` have one each beside it.
@@ -78,7 +79,7 @@ def learn_map(
     """
     settings = settings or Settings()
     check_settings(settings, "map")
-    old = load_texture(Path(init)) if isinstance(init, str | Path) else init
+    old = load_known(Path(init)) if isinstance(init, str | Path) else init
     with open_recording(experiment, cameras, textured=False) as recording, one_thread():
         names = recording.experiment.names
         if old is not None and not recording.experiment.alone:

@@ -16,7 +16,7 @@ import torch
 
 from sphereorient.cameras.response import Response
 from sphereorient.errors import Reason, TrackError, error_words, refusal
-from sphereorient.experiment.recording import Recording
+from sphereorient.experiment.recording import CameraStream, Recording
 from sphereorient.files.hdf5 import DAMAGE, SPHERES, ball_group, ball_groups, digest, whole_hdf5
 from sphereorient.files.threads import Progress
 from sphereorient.follow import Appearance
@@ -102,7 +102,7 @@ class Learnt:
         )
 
     def appearance(self, recording: Recording) -> Appearance:
-        """Return the estimated appearance. Raises TrackError: other cameras or another picture size."""
+        """Return the estimated appearance. Raises TrackError: other cameras, another picture size or response."""
         used = {stream.name: stream.movie.frame_shape for stream in recording.streams}
         known = {name: scene.background.mean.shape for name, scene in self.scenes.items()}
         if list(used.items()) != list(known.items()):
@@ -110,7 +110,7 @@ class Learnt:
             expected, got = (", ".join(f"{name} {shape}" for name, shape in each.items()) for each in (other, known))
             do = "pass a file of the same cameras"
             raise TrackError(refusal("learnt", expected=f"learnt results of {expected}", got=got, do=do))
-        views = [CameraView.of(stream.name, stream.camera, self.scenes[stream.name]) for stream in recording.streams]
+        views = [CameraView.of(one.name, one.camera, _shown(self.scenes[one.name], one)) for one in recording.streams]
         widest = max(scene.diameter_px for scene in self.scenes.values())
         base = finest_table(recording.texture, widest, recording.unseen)
         paint = base if self.worn is None else without(base, self.worn)
@@ -128,6 +128,15 @@ class Learnt:
             fitter = replace(still, optics=optics, instants=self.instants)
         shared = {name: getattr(self, name) for name in OF_APPEARANCE}
         return Appearance(fitter=fitter, still=still, lasting=self.lasting, **shared)
+
+
+def _shown(scene: CameraScene, stream: CameraStream) -> CameraScene:
+    """Return a learnt scene with the mask of the experiment."""
+    if stream.response not in (None, scene.response):
+        got, do = str(scene.response or "linear"), "learn anew: leave --learnt out"
+        name = f"learnt, response of {stream.name}"
+        raise TrackError(refusal(name, expected=str(stream.response), got=got, do=do))
+    return replace(scene, background=replace(scene.background, shown=stream.shown))
 
 
 def save_learnt(learnt: Mapping[str, Learnt], path: Path) -> None:

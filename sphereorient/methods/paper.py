@@ -28,7 +28,8 @@ CHUNK = 64  # frames in memory; no effect on results
 
 
 def _learn(job: Job, progress: Progress) -> None:
-    """Learn nothing: the stages use the whole movie."""
+    """Learn nothing: the stages use the whole movie. Raises ExperimentError: several balls."""
+    _ = job.recording.experiment.sphere
 
 
 def track_paper(

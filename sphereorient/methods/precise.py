@@ -7,11 +7,12 @@ from itertools import accumulate
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from sphereorient import motion
 from sphereorient.assemble import Chosen, PathLayer
 from sphereorient.assemble.identity import same_balls
-from sphereorient.errors import ExperimentError, refusal
+from sphereorient.errors import ExperimentError, Reason, refusal
 from sphereorient.files.threads import Progress
 from sphereorient.follow.appearance import Appearance, estimate_appearance
 from sphereorient.follow.ball import BallTracker
@@ -129,13 +130,22 @@ def join_ball(job: Job, appearance: Appearance, table: PoseTable) -> tuple[Traje
     first, second = torch.combinations(torch.arange(len(job.recording.streams)), 2).unbind(1)
     turn, spread = picked["own_turn"], picked["own_covariance"]
     apart, spread = turn[:, first] - turn[:, second], spread[:, first] + spread[:, second]
-    counts = table.use[:, first] & table.use[:, second] | (table.use.sum(1) < 2)[:, None]
-    apart = torch.where(counts[..., None], apart, torch.nan)  # without a camera that contradicts those in use
+    counts = comparable_cameras(table)
+    apart = torch.where((counts[:, first] & counts[:, second])[..., None], apart, torch.nan)
     share = motion.lasting_share(apart, spread, chosen.segment, settings.smooth.slow_share)
     smooth = settings.smooth.model_copy(update={"slow_share": share})
     smoothed = motion.smooth_motion(poses, smooth, None if given is None else given.process)
     track = results.precise_track(job.recording.experiment, clock, table, chosen, smoothed, appearance)
     return track, Learnt.of(appearance, smoothed.process, float(chosen.acceleration_rad_s2))
+
+
+def comparable_cameras(table: PoseTable) -> Tensor:
+    """Return the cameras (N, C) whose own rotations are compared: those in use, or, where one alone is used, also those
+    that contradict it.
+    """
+    saw = [[why in (Reason.OK, Reason.CONTRADICTS) for why in row] for row in table.reason]
+    alone = (table.use.sum(1) < 2)[:, None] & torch.tensor(saw, dtype=torch.bool).reshape(table.use.shape)
+    return table.use | alone
 
 
 def _named(tables: Sequence[PoseTable], job: Job, follower: Follower) -> tuple[Sequence[PoseTable], Sequence[Floats]]:

@@ -107,6 +107,7 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
     position, R = picked["position_lab_mm"] + picked["own_move"][:, place], picked["R_lab_body"]
     position = torch.where(usable[:, None], position, picked["position_lab_mm"])
     centre_px, radius_px = view.camera.project(position), view.radius_px(position, learnt.fitter.radius_mm)
+    sigma_px = picked["own_sigma_mm"][:, place] * radius_px / learnt.fitter.radius_mm
     counts = table.mask.sum(-1)
     shown = usable & torch.isfinite(position[:, 0])
     where = shown[:, None, None]
@@ -123,7 +124,7 @@ def precise_camera(place: int, table: PoseTable, picked: Mapping[str, Tensor], l
     return replace(
         CameraTrack.empty(frames),
         centre_px=centre_px.numpy(),
-        centre_sigma_px=(picked["own_sigma_mm"][:, place] * radius_px / learnt.fitter.radius_mm).numpy(),
+        centre_sigma_px=torch.where(shown, sigma_px, torch.nan).numpy(),
         radius_px=radius_px.numpy(),
         limb_coverage=torch.where(shown, picked["limb_coverage"][:, place], torch.nan).numpy(),
         orientation=torch.where(where, turned_alone(picked, place), torch.nan).numpy(),

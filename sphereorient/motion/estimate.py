@@ -71,14 +71,14 @@ def estimate(
     Return the estimates, the ratio of true errors to sigmas of the measurements, and the process.
     """
     if known is None:
-        # pieces of the segments, an even selection if there are too many
-        starts = [(path, k) for path in paths for k in range(0, len(path.time), PIECE)]
-        total, most = sum(len(path.time) for path in paths), settings.learn_frames
+        # usable pieces of the segments, an even selection if there are too many
+        parts = [(path, slice(k, k + PIECE)) for path in paths for k in range(0, len(path.time), PIECE)]
+        parts = [(path, part) for path, part in parts if path.used[part].sum() >= FEWEST]
+        total, most = sum(len(path.time[part]) for path, part in parts), settings.learn_frames
         if total > most:
-            count = max(1, round(len(starts) * most / total))
-            starts = [starts[k] for k in np.linspace(0, len(starts) - 1, count).round().astype(int)]
-        pieces = [path.part(slice(k, k + PIECE)) for path, k in starts]
-        pieces = [piece for piece in pieces if piece.used.sum() >= FEWEST]
+            count = max(1, round(len(parts) * most / total))
+            parts = [parts[k] for k in np.linspace(0, len(parts) - 1, count).round().astype(int)]
+        pieces = [path.part(part) for path, part in parts]
         if sum(int(path.used.sum()) for path in pieces) < settings.least_frames:
             return [_alone(path) for path in paths], 1.0, None
         known = _learnt(pieces, band, settings)
@@ -146,7 +146,7 @@ def _judged(path: SegmentTrack, states: SmoothedStates, limit: float, share: flo
 def _smoothed(path: SegmentTrack, learnt: ProcessPrior, settings: SmoothSettings) -> Estimate:
     """Return a segment's estimate; one measurement gives no rate, two no change of it."""
     if (count := int(path.used.sum())) < 2:
-        return _alone(path)
+        return _alone(path, learnt.scale**2 / (1 - settings.slow_share))
     settled, states, _ = _settled(path, learnt, settings)
     rate, change = settled.mean + settled.rate[:, 0], settled.rate[:, 1] * settled.pole
     covariance = states.covariance.copy()
@@ -160,10 +160,11 @@ def _smoothed(path: SegmentTrack, learnt: ProcessPrior, settings: SmoothSettings
     return Estimate(value=settled.reference, rate=rate, change=change, covariance=covariance, rejected=rejected)
 
 
-def _alone(path: SegmentTrack) -> Estimate:
+def _alone(path: SegmentTrack, factor: float = 1.0) -> Estimate:
+    """Return the measurements as they are, without rates, their covariances times a factor."""
     count, seen = len(path.time), path.seen
     unknown, covariance = np.full((count, 3), np.nan), np.full((count, 9, 9), np.nan)
-    covariance[seen, VALUE, VALUE] = path.covariance[seen]
+    covariance[seen, VALUE, VALUE] = factor * path.covariance[seen]
     value = np.where(seen.reshape(-1, *(1,) * (path.value.ndim - 1)), path.value, np.nan)
     return Estimate(value=value, rate=unknown, change=unknown, covariance=covariance, rejected=np.zeros(count, bool))
 

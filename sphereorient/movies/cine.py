@@ -58,6 +58,8 @@ class CineMovie(Movie):
         count = int(there[-1]) + 1  # at least one is whole
         used = f" ({self._real_bits} of them used)" if 0 < self._real_bits < layout.bits else ""
         super().__init__(path, f".cine, {layout.name}{used}", count, self._size, np.dtype(layout.dtype))
+        if 8 < self._real_bits <= 14:  # 16 may be the size of a pixel only
+            self.full_scale = float(2**self._real_bits - 1)
         self.times_s, remarks = self._times(count)
         self.remarks = (*self._truncated(self._stated), *remarks, *self._pixel_remarks())
 

@@ -30,6 +30,7 @@ class Movie:
     dtype: np.dtype[Any]  # uint8, or uint16 for files with more than 8 bits; values are not rescaled
     times_s: Stamps | None = None  # (N,), s, time stamps of the recording; None: none, or of a player
     times_unit: str = "s"  # of these stamps in the file; empty: not stated, s is assumed
+    full_scale: float | None = None  # grey level of white in more than 8 bits, where the file says it
     played_hz: float | None = None  # rate of players; the recording's rate only for ordinary cameras
     photographs: bool = False  # whether these are 8-bit picture files of an ordinary camera
     remarks: tuple[str, ...] = ()  # warnings for the user: truncated, colour converted to grey, lossy codec
@@ -118,7 +119,7 @@ class FlippedMovie(Movie):
         self.times_s, self.times_unit, self.played_hz = movie.times_s, movie.times_unit, movie.played_hz
         others = (remark for remark in movie.remarks if f"flip: {how}" not in remark)  # without the advice to flip
         self.remarks = (*others, f"flipped on reading: {how}")
-        self.photographs = movie.photographs
+        self.photographs, self.full_scale = movie.photographs, movie.full_scale
         self._movie, self._how = movie, how
 
     def _read(self, numbers: Sequence[int]) -> Iterator[Grey]:

@@ -20,7 +20,7 @@ from sphereorient.movies.write import write_movie
 
 RING_BYTES, MOST_WAIT = 128 << 20, 1000  # of frames waiting for the disk; times that fit into the smallest pipe
 LEFT_BYTES = 200_000_000  # left free on the disk when a recording ends
-EVERY = 64  # frames between checks of the disk
+EVERY, EVERY_BYTES = 64, 16 << 20  # frames, and their bytes, between checks of the disk
 BEGIN_S, ROOM_S, SHORTEST_S = 20.0, 0.001, 1e-6  # for the process to start; between checks for room; least of a frame
 
 
@@ -105,9 +105,12 @@ class Recorder:
 
 def _record(path: Path, ring: _Ring, stamps: Connection, lines: Connection, frame_s: float, left_bytes: int) -> None:
     """Write a movie of the frames whose times arrive, until the sender ends; send a line for each problem."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the tracking
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # Ctrl-C, a closed terminal: the sender ends, then this process
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
     memory, written, shape, dtype = ring
     times_s, frames = list[float](), np.frombuffer(memory, dtype).reshape(-1, *shape)
+    every = max(1, min(EVERY, EVERY_BYTES // frames[0].nbytes))
 
     def taken() -> Iterator[Grey]:
         shift_s = 0.0
@@ -116,7 +119,7 @@ def _record(path: Path, ring: _Ring, stamps: Connection, lines: Connection, fram
                 (time_s,) = struct.unpack("d", stamps.recv_bytes())
                 if times_s and time_s + shift_s <= times_s[-1]:  # times of a movie increase
                     shift_s = times_s[-1] + frame_s - time_s
-                if len(times_s) % EVERY == 0 and (free := shutil.disk_usage(path.parent).free) < left_bytes:
+                if len(times_s) % every == 0 and (free := shutil.disk_usage(path.parent).free) < left_bytes:
                     got, do = f"{free / 1e6:.0f} MB left", "make room; the recording ends here, tracking goes on"
                     lines.send_bytes(refusal(str(path), expected="a disk with room", got=got, do=do).encode())
                     stamps.close()

@@ -49,6 +49,8 @@ class VideoMovie(Movie):
             interlaced = frame.interlaced_frame or by_stream
             rate = container.streams.video[0].average_rate
             self.played_hz = float(rate) if rate else None
+            bits = frame.format.components[0].bits
+            self.full_scale = float(2**bits - 1) if 8 < bits <= 14 else None  # 16 may hold fewer
         self._checked = False  # whether the packets have verifiable check sums
         with _opened(path) as container:
             self._index, end_s, broken = self._read_index(container)

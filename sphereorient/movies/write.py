@@ -54,7 +54,8 @@ def times_path(path: Path) -> Path:
 def write_ffv1(path: Path | str, frames: Iterable[Grey | None], frame_rate_hz: float) -> int:
     """Write grey frames as FFV1 in Matroska; see `write_movie`."""
     path = Path(path)
-    rate = Fraction(frame_rate_hz).limit_denominator(1_000_000)
+    most = max(1, min(1_000_000, int(2e9 / max(frame_rate_hz, 1.0))))  # numerators have 31 bits
+    rate = Fraction(frame_rate_hz).limit_denominator(most)
     count, first, checked = _checked(path, frames)
     black = np.zeros_like(first)
     with put_aside(path, also=(av.FFmpegError,)) as aside, av.open(str(aside), "w", format="matroska") as container:

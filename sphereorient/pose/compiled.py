@@ -261,11 +261,12 @@ def _near(
     task, at = _task_of(begin, model, instants)
     some, more = in_torch.further_steps(model)
     near = Near(task=task, some_more=some, all_more=more, near_rad=model.near_rad, most_hidden=hidden)
-    near.some, near.all = (_of_stencil(one) for one in (thinned_stencil(stencil, in_torch.FIRST_EVERY), stencil))
+    stencils = thinned_stencil(stencil, in_torch.FIRST_EVERY), stencil
+    near.some, near.all = (_of_stencil(one) for one in stencils)
     known = [_of_view(view) for view in views]
     scene = (_Scene * len(views))(*(one[0] for one in known))
     near.scene = ctypes.addressof(scene)
-    return near, at, (known, scene)
+    return near, at, (known, scene, stencils)
 
 
 class _Addresses:

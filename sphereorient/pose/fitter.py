@@ -117,7 +117,7 @@ class Fitter:
 
     def stencil(self, level: PyramidLevel, radius_px: float) -> Stencil:
         """Return the stencil of a disk of a given radius, px, at a level."""
-        return level.stencil(min(radius_px, 0.5 * max(self.views[0].camera.image_size)))
+        return level.stencil(min(radius_px, 0.5 * max(max(view.camera.image_size) for view in self.views)))
 
     def places(
         self,

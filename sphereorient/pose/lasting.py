@@ -46,7 +46,11 @@ class Lasting:
 
     def of_use(self, use: Tensor) -> Tensor:
         """Return the covariance (6, 6) of a pose by the cameras in use, (C,) bool."""
-        return self.alone[use][0] if int(use.sum()) == 1 else self.covariance
+        count = int(use.sum())
+        if count == 1:
+            return self.alone[use][0]
+        # Errors of the cameras are independent, as in `with_lasting_errors`.
+        return self.covariance * (len(use) / max(count, min(2, len(use))))
 
     def widened(self, one: FittedPoses, other: FittedPoses, use: Tensor) -> "Lasting":
         """Return errors that include the mean difference of B poses between two equally good models, `use` (B, C)."""

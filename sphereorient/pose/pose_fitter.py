@@ -55,12 +55,12 @@ class PoseFitter(nn.Module):
         radius_mm: of the sphere.
         diameter_px: expected diameter of the sphere's disk in the pictures.
         blur_px: standard deviation of optics, pixel and exposure together, px.
-        background: (C, H, W), grey levels of the scene without the sphere; None: black.
+        background: (C, H, W), or (H, W) for one camera, grey levels of the scene without the sphere; None: black.
 
     Raises:
-        CameraError: not a camera.
-        SettingsError: radius or diameter not above 0.
-        ShapeError: texture is not (H, 2 H), or not of numbers 0 .. 1.
+        CameraError: not a camera, none, or cameras of different picture sizes.
+        SettingsError: radius, diameter or blur not above 0.
+        ShapeError: texture is not (H, 2 H), or not of numbers 0 .. 1; background of another shape than the pictures.
     """
 
     def __init__(
@@ -75,19 +75,14 @@ class PoseFitter(nn.Module):
     ) -> None:
         super().__init__()
         seen = list(cameras) if isinstance(cameras, Sequence) else [cameras]
-        for one in seen:
-            if not hasattr(one, "image_size"):
-                do = "pass one of load_cameras(path).values(), or a list of them"
-                raise CameraError(refusal("cameras", expected="cameras", got=type(one).__name__, do=do))
-        for name, value in (("radius_mm", radius_mm), ("diameter_px", diameter_px)):
+        _check_cameras(seen)
+        for name, value in (("radius_mm", radius_mm), ("diameter_px", diameter_px), ("blur_px", blur_px)):
             if not value > 0:
                 raise SettingsError(refusal(name, expected="a number above 0", got=f"{value:g}", do="measure it"))
         paint, hidden = known_paint(texture)
         self.register_buffer("texture", paint.float())
         views = []
-        for k, camera in enumerate(seen):
-            width, height = camera.image_size
-            mean = np.zeros((height, width), np.float32) if background is None else _grey(background[k])
+        for k, (camera, mean) in enumerate(zip(seen, _scenes(background, seen), strict=True)):
             noise = np.full(mean.shape, NOISE, np.float32)
             scene = CameraScene(
                 background=Background(mean=mean, noise=noise, full_scale=float("inf")), diameter_px=diameter_px
@@ -125,7 +120,7 @@ class PoseFitter(nn.Module):
             )
         check_finite("pictures", grey)
         frames = [[_grey(one) for one in row] for row in grey.reshape(-1, len(views), height, width)]
-        R, X = R.reshape(-1, 3, 3), X.expand(*lead, 3).reshape(-1, 3)
+        R, X = R.reshape(-1, 3, 3), _of_each(X, lead).reshape(-1, 3)
         use = torch.ones(len(R), len(views), dtype=torch.bool)
         fit = FittedPoses(**blank_parts(len(views), 0))
         if len(R):
@@ -136,6 +131,41 @@ class PoseFitter(nn.Module):
         found |= {"explained": explained, "converged": converged}
         found["covariance"] = torch.where((explained & converged)[:, None, None], fit.covariance, torch.nan)
         return PoseFit(**{name: part.reshape((*lead, *part.shape[1:])) for name, part in found.items()})
+
+
+def _check_cameras(cameras: Sequence[Camera]) -> None:
+    do = "pass one of load_cameras(path).values(), or a list of them"
+    for one in cameras:
+        if not hasattr(one, "image_size"):
+            raise CameraError(refusal("cameras", expected="cameras", got=type(one).__name__, do=do))
+    if not cameras:
+        raise CameraError(refusal("cameras", expected="one or more", got="none", do=do))
+    sizes = [f"{width} x {height} px" for width, height in dict.fromkeys(one.image_size for one in cameras)]
+    if len(sizes) > 1:
+        do = "pad the pictures to one size, with image_size to match"
+        raise CameraError(refusal("cameras", expected="one picture size", got=", ".join(sizes), do=do))
+
+
+def _scenes(background: Tensor | NDArray[np.generic] | None, cameras: Sequence[Camera]) -> list[NDArray[np.float32]]:
+    """Return the background (H, W) of each of C cameras, from (C, H, W), or (H, W) for one; None: black."""
+    width, height = cameras[0].image_size
+    if background is None:
+        return [np.zeros((height, width), np.float32) for _ in cameras]
+    scenes = [_grey(one) for one in (background[None] if np.ndim(background) == 2 else background)]
+    if [one.shape for one in scenes] != [(height, width)] * len(cameras):
+        expected, got = f"shape ({len(cameras)}, {height}, {width})", str(tuple(np.shape(background)))
+        raise ShapeError(refusal("background", expected=expected, got=got, do="pass one scene per camera"))
+    return scenes
+
+
+def _of_each(position_lab_mm: Tensor, lead: torch.Size) -> Tensor:
+    """Return positions for all poses, (*lead, 3); raise ShapeError for another number of them."""
+    try:
+        return position_lab_mm.expand(*lead, 3)
+    except RuntimeError as error:
+        expected, got = f"shape {(*lead, 3)} or (3,)", str(tuple(position_lab_mm.shape))
+        do = "pass one position per pose, or one for all"
+        raise ShapeError(refusal("position_lab_mm", expected=expected, got=got, do=do)) from error
 
 
 def _grey(picture: Tensor | NDArray[np.generic]) -> NDArray[np.float32]:

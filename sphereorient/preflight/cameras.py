@@ -75,7 +75,8 @@ def track_stretch(
     position = torch.from_numpy(track.position)
     wider = [outline_stretch(sample, position, experiment.radius_mm) for sample in stretch]
     found = compare_cameras(replace(seen, outline_stretch=torch.stack(wider, 1)), limits)
-    if found.frames < FEWEST or math.isnan(found.turn_deg):
+    measurable = found.frames >= FEWEST and not math.isnan(found.turn_deg)
+    if not measurable:
         both = "both" if len(stretch) == 2 else "two"
         measured = f"cannot tell: {both} cameras show the ball and its paint in {found.frames} of {len(track)} frames"
         agree = warning(TITLE, measured, "see the findings on the ball and on the map")
@@ -85,7 +86,7 @@ def track_stretch(
         agree = unsure(agree, experiment, len(stretch[0].stream))
     measured, _, do = TWO_BALLS.rpartition("; ")
     balls = (judged("one ball", measured, (True, FAULT, do)),) if learnt.second_ball else ()
-    return Tracked(findings=(*balls, agree), overrules=True)
+    return Tracked(findings=(*balls, agree), overrules=measurable)
 
 
 def unsure(finding: Finding, experiment: Experiment, total: int) -> Finding:

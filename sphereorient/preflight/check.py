@@ -78,6 +78,10 @@ def preflight(
         measures = image is not None and pool.submit(texture_map.measure_texture, image)
         similar = image is not None and pool.submit(texture_map.most_similar_views, image, settings.search)
         samples = tuple(one.result() for one in sampling)
+        most = max((one.frame for one in samples), key=len).tolist()  # more of a camera without a ball
+        samples = tuple(
+            one if len(one.frame) == len(most) else sample_more(one, most, settings.locate) for one in samples
+        )
         near = as_near(settings.search, [(sample.camera, sample.diameter_px) for sample in samples])
         search = image is not None and pool.submit(GreySearch, image, near)
         progress("frames", len(samples), len(samples))

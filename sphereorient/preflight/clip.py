@@ -13,6 +13,7 @@ from sphereorient.experiment.experiment import Experiment, input_error
 from sphereorient.experiment.recording import given_mask, open_recording
 from sphereorient.files.page_server import Json
 from sphereorient.files.threads import silent
+from sphereorient.locate.background import full_scale_of
 from sphereorient.locate.scene import fixed_ball
 from sphereorient.mapping.adjustment import adjusted
 from sphereorient.mapping.disks import held_place
@@ -34,8 +35,14 @@ class Clip:
             raise input_error(f"{experiment.path}, sphere.fixed", "one fixed ball", "another", do)
         with open_recording(experiment, textured=False) as recording:
             self._frame_s = recording.timeline.frame_s
-            read = {one.name: one.pictures(0, FRAMES) for one in recording.streams}
-            self._pictures = {name: [one for one, _ in each if one is not None] for name, each in read.items()}
+            rows = zip(*(one.pictures(0, FRAMES) for one in recording.streams), strict=True)
+            read = [tuple(one for one, _ in row if one is not None) for row in rows]
+            whole = [row for row in read if len(row) == len(recording.streams)]  # the cameras stay in step
+            if not whole:
+                got, do = "none", "correct start:, or export the movies again"
+                raise input_error(f"{experiment.path}, movies", "frames with a picture of each camera", got, do)
+            names = [one.name for one in recording.streams]
+            self.pictures = dict(zip(names, zip(*whole, strict=True), strict=True))
 
     def tracked(self, experiment: Experiment) -> Json:
         """Track the clip with circles, masks, response and cameras of another experiment, by the first pass without
@@ -44,8 +51,8 @@ class Clip:
         """
         begun, settings = time.perf_counter(), Settings()
         with tempfile.TemporaryDirectory() as folder:
-            paths = {name: Path(folder, f"{name}.npy") for name in self._pictures}
-            shown = {name: _light(each, experiment.response.get(name)) for name, each in self._pictures.items()}
+            paths = {name: Path(folder, f"{name}.npy") for name in self.pictures}
+            shown = {name: in_light(each, experiment.response.get(name)) for name, each in self.pictures.items()}
             for name, lit in shown.items():
                 np.save(paths[name], np.array([flipped_picture(one, experiment.flip.get(name, "none")) for one in lit]))
             masks = {name: given_mask(experiment, name, lit[0].shape) for name, lit in shown.items()}
@@ -75,8 +82,9 @@ class Clip:
         }
 
 
-def _light(pictures: Sequence[Grey], response: Response | None) -> Sequence[Grey]:
+def in_light(pictures: Sequence[Grey], response: Response | None) -> Sequence[Grey]:
+    """Return the pictures of a camera in light, by its response; as they are if it is linear or unknown."""
     if response is None or response.linear:
         return pictures
-    full = float(np.iinfo(pictures[0].dtype).max)
+    full = full_scale_of(np.array([one.max() for one in pictures]))
     return [(response.light(one, full) * (65535 / full)).round().astype(np.uint16) for one in pictures]

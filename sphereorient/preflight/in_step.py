@@ -12,7 +12,7 @@ from torch import Tensor
 from sphereorient.calibration.comparison import LATEST, gaps_between
 from sphereorient.cameras import Camera
 from sphereorient.preflight.finding import FAULT, WARNING, Finding, judged, warning
-from sphereorient.preflight.sample import MovieSample, pair_starts
+from sphereorient.preflight.sample import MovieSample
 
 STRETCH, STRETCHES = 20, 2  # consecutive frames in one stretch, and number of stretches
 MOVES_PX = 0.3  # least motion per frame across the lines of sight that shows an offset
@@ -51,13 +51,14 @@ class OffsetScan:
 def liveliest_stretches(samples: Sequence[MovieSample]) -> list[range]:
     """Choose stretches of consecutive frames with much, and different, motion: a late movie's gap varies."""
     count = len(samples[0].stream)
-    starts = pair_starts(count)
+    frame = samples[0].frame
+    starts = frame[:-1][np.diff(frame) == 1].tolist()  # the next frame follows in the sample
     if not starts:
         return []
     first, second = samples[:2]
     gaps = gaps_between((first.camera, second.camera), (first.sightings.centre_px, second.sightings.centre_px))
     across_px = (gaps.position_lab_mm * gaps.across_lab).sum(-1) * gaps.per_mm_px
-    index = np.searchsorted(samples[0].frame, starts)  # the next frame follows in the sample
+    index = np.searchsorted(frame, starts)
     moved = torch.nan_to_num(across_px[index + 1] - across_px[index])
     liveliest = int(moved.abs().argmax())
     order = (moved - moved[liveliest]).abs().argsort(descending=True).tolist()
@@ -139,6 +140,7 @@ def in_step(scans: Sequence[OffsetScan], start: Mapping[str, int]) -> Finding:
     title, moved_px = "movies in step", max(scan.moved_px for scan in scans)
     if moved_px <= MOVES_PX:
         return judged(title, f"unknown: the ball moves {moved_px:.2f} px a frame across the lines of sight")
+    unknown = [scan.names[1] for scan in scans if scan.moved_px <= MOVES_PX]
     scans = [scan for scan in scans if scan.moved_px > MOVES_PX]
     late = {scans[0].names[0]: 0.0} | {scan.names[1]: scan.best for scan in scans}
     # Two movies: late against the first; more: against the majority.
@@ -151,6 +153,7 @@ def in_step(scans: Sequence[OffsetScan], start: Mapping[str, int]) -> Finding:
     measured = f"{name} shows the same instant {abs(late[name]):.2f} frames "
     measured += "later" if late[name] > 0 else "earlier"
     measured += f" (the ball moves {moved_px:.1f} px a frame across the lines of sight)"
+    measured += f"; {', '.join(unknown)}: unknown" if unknown else ""
     shifted = [scan for scan in scans if scan.shift]
     if not shifted:
         which = "both" if len(scans) == 1 else "all"
@@ -159,6 +162,7 @@ def in_step(scans: Sequence[OffsetScan], start: Mapping[str, int]) -> Finding:
     now = max(float(scan.gap_px[LATEST]) for scan in shifted)
     best = max(float(scan.gap_px.min()) for scan in shifted)
     measured += f"; the gap falls from {now:.2f} to {best:.2f} px"
+    late |= dict.fromkeys(unknown, late[scans[0].names[0]])  # they stay in step with the first movie
     begins = ", ".join(f"{one}: {first}" for one, first in starts_in_step(start, late).items())
     weak = (now < CLEARLY * best, WARNING, "look at one event in both movies: this evidence is weak")
     return judged(title, measured, weak, (True, FAULT, f"set start: {{{begins}}}"))

@@ -122,7 +122,8 @@ class MaskMarking(Marking):
             tried = self._changed(name, asked, Path(folder))  # checks all of it first
         keys: Json = {}
         if asked.get("circle") is not None:
-            keys["circles"] = {one: [round(part, 2) for part in circle] for one, circle in tried.circles.items()}
+            new = [round(part, 2) for part in tried.circles[name]]
+            keys["circles"] = dict(self.read().get("circles") or {}) | {name: new}
         if asked.get("light") is not None:
             old = self.read().get("response")
             each = old if isinstance(old, dict) and old.keys() != {"gamma"} else dict.fromkeys(self.movies, old)

@@ -131,8 +131,9 @@ def exposure(sample: MovieSample) -> Finding:
     for picture, outline in sample.balls:
         row, column = np.ogrid[: picture.shape[0], : picture.shape[1]]
         square = (row - outline.v_px) ** 2 + (column - outline.u_px) ** 2
-        values.append(picture[square < (INSIDE * outline.radius_px) ** 2])
-    if not values:
+        inside, shown = square < (INSIDE * outline.radius_px) ** 2, sample.stream.shown
+        values.append(picture[inside if shown is None else inside & shown])
+    if not any(map(len, values)):
         return judged(title, "unknown: no ball was found")
     grey, full_scale, noise = np.concatenate(values), sample.background.full_scale, sample.background.typical_noise
     black, white = np.percentile(grey, [5, 95])

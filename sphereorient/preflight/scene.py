@@ -16,6 +16,7 @@ from sphereorient.errors import PaintError
 from sphereorient.experiment import Sphere
 from sphereorient.experiment.recording import Recording, load_map
 from sphereorient.files.threads import Progress, counted
+from sphereorient.files.whole_file import relative_path
 from sphereorient.follow.follower import sample_frames
 from sphereorient.follow.initialise import Initialiser
 from sphereorient.follow.scene_start import EXPLAINED, SceneFound, SceneStart
@@ -77,13 +78,14 @@ def look_at_scene(
         for c, (view, shot) in enumerate(zip(cameras, frames[best], strict=True))
         if shot.usable
     )
+    named = {relative_path(path, job.recording.experiment.folder): one for path, one in loaded.items()}
     contrasts = {
-        path.name: texture_map.judge_contrast(texture_map.measure_texture(one.grey), _least_px(balls))
-        for path, one in loaded.items()
+        name: texture_map.judge_contrast(texture_map.measure_texture(one.grey), _least_px(balls))
+        for name, one in named.items()
     }
     if len(loaded) > 1:
         contrasts = {name: replace(one, title=f"{one.title} {name}") for name, one in contrasts.items()}
-    one_paint = same_paint({path.name: one.grey for path, one in loaded.items()}, progress)
+    one_paint = same_paint({name: one.grey for name, one in named.items()}, progress)
     sizes = ball_sizes(found, disks, balls)
     return seen, [*disk_counts(disks, balls), *found_balls(found, balls), *sizes, *contrasts.values(), *one_paint]
 

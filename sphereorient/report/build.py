@@ -205,7 +205,9 @@ def _folder(out: Path) -> Iterator[Path]:
 def check_report_folder(out: Path) -> None:
     """Raise OutputError if a folder contains more than an older report (its page carries the mark)."""
     page, found = out / "index.html", set(out.rglob("*"))
-    ours = {path for part, kinds in KINDS.items() for kind in kinds for path in (out / part).glob(f"*{kind}")}
+    named = page.read_text("utf-8", "replace") if has_mark(page) else ""  # of all that the older report made
+    made = (path for part, kinds in KINDS.items() for kind in kinds for path in (out / part).glob(f"*{kind}"))
+    ours = {path for path in made if f"{path.parent.name}/{path.stem}." in named}
     whole = has_mark(page) and found <= ours | {page, *(out / part for part in KINDS)}
     if (out.exists() and not out.is_dir()) or (found and not whole):
         expected, do = "a new folder, or one with an older report only", "choose a new folder"

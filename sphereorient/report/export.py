@@ -12,6 +12,7 @@ from sphereorient.errors import OutputError, refusal
 from sphereorient.files.provenance import package
 from sphereorient.files.whole_file import put_aside
 from sphereorient.report import columns as table
+from sphereorient.report.frame_warnings import frame_numbers
 from sphereorient.trajectory import CameraTrack, Trajectory, quaternions_wxyz
 from sphereorient.trajectory.walk import FicTracAxes, fictrac_rows, walk_of
 
@@ -125,7 +126,7 @@ def fictrac_table(track: Trajectory, axes: FicTracAxes) -> Floats:
         ahead,
         right,
         walk.start,
-        frame=count,
+        frame=frame_numbers(track),
         turn_lab=walk.turn_rad,
         error=np.sqrt(np.trace(track.orientation_cov, axis1=1, axis2=2)),
         path=walk.path,

@@ -127,13 +127,14 @@ def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[tuple[str
 
 
 def _each(tracks: Table) -> Grid:
+    length = "mm" if "stated_error_mm" in tracks.rows[0] else "radii"
     shown = {
         "frames": "frames",
         "valid": "valid",
         "doubtful": "in doubt",
         "stated_error_deg": "stated error, \u00b0",
-        "stated_error_mm": "stated error, mm",
-        "rms_v_m_s": "rms of v, m/s",
+        f"stated_error_{length}": f"stated error, {length}",
+        **({"rms_v_m_s": "rms of v, m/s"} if length == "mm" else {"rms_v_radii_s": "rms of v, radii/s"}),
         "rms_omega_rad_s": "rms of \u03c9, rad/s",
         "duration_s": "duration, s",
     }

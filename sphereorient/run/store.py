@@ -6,8 +6,10 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -70,10 +72,21 @@ def fingerprint(request: Request) -> dict[str, str]:
         "cameras": "all" if request.cameras is None else ",".join(request.cameras),
         "device": request.device,
         "experiment": _digest(experiment.path.read_text(encoding="utf-8")),
+        "fields": _digest(_fields(experiment)),  # Python may change them
     }
     return found | {
         path.name if n == 0 else f"{path.name} ({n})": _stamp(path) for (path, n) in _files(request, experiment)
     }
+
+
+def _fields(experiment: Experiment) -> str:
+    """Return the fields of an experiment as text; of paths the name, as the same file may be named in other ways."""
+
+    def plain(value: Any) -> Any:
+        return value.name if isinstance(value, Path) else getattr(value, "tolist", partial(str, value))()
+
+    times = experiment.times and Path(experiment.times).name
+    return json.dumps(asdict(replace(experiment, times=times)), default=plain)
 
 
 def _files(request: Request, experiment: Experiment) -> list[tuple[Path, int]]:

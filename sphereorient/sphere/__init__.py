@@ -2,6 +2,7 @@
 
 from sphereorient.sphere.renderer import Sampling, SphereRenderer, see_sphere
 from sphereorient.sphere.texture import (
+    load_known,
     load_texture,
     load_unseen,
     read_seen,

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from sphereorient.cameras import Camera, Rays
 from sphereorient.cameras.model import TelecentricCamera
-from sphereorient.errors import CameraError, SettingsError, check_tail, refusal, tensor_of
+from sphereorient.errors import CameraError, SettingsError, ShapeError, check_tail, refusal, tensor_of
 from sphereorient.so3 import check_rotations
 from sphereorient.sphere.texture import known_paint, reduced_texture
 from sphereorient.sphere.view import paint_seen, smooth_positive, sphere_normals
@@ -101,8 +101,8 @@ class SphereRenderer(nn.Module):
             do = "pass the sphere's radius"
             raise SettingsError(refusal("radius_mm", expected="a number above 0", got=f"{radius_mm:g}", do=do))
         values = known_paint(texture)[0]
-        if isinstance(values, nn.Parameter):
-            self.texture = values
+        if isinstance(texture, nn.Parameter):  # a new one if unknown paint was replaced
+            self.texture = values if values is texture else nn.Parameter(values.detach())
         else:
             self.register_buffer("texture", values)
         self.radius_mm = radius_mm
@@ -116,7 +116,7 @@ class SphereRenderer(nn.Module):
 
         Raises:
             CameraError: sphere not wholly in front of the camera, or not wholly in the liquid.
-            ShapeError: orientations that are no rotations.
+            ShapeError: orientations that are no rotations, or shapes that do not agree.
         """
         R = tensor_of("R_lab_body", R_lab_body).to(self.texture.device)
         check_rotations("R_lab_body", R)
@@ -125,7 +125,7 @@ class SphereRenderer(nn.Module):
         position = torch.as_tensor((0.0,) * 3 if position_mm is None else position_mm).to(R.device, exact)
         check_tail("position_mm", position, 3)
         radius = torch.as_tensor(self.radius_mm if radius_mm is None else radius_mm).to(position)
-        shape = np.broadcast_shapes(R.shape[:-2], position.shape[:-1], radius.shape)
+        shape = _common_shape(R, position, radius)
         if position.numel() == 3 and radius.numel() == 1:  # one position: the rays are computed once
             position, radius = position.reshape(1, 3), radius.reshape(1)
         else:
@@ -178,6 +178,17 @@ class SphereRenderer(nn.Module):
             canvas = canvas.index_put(place, window, accumulate=True)
             pictures.append(canvas[:, size : size + height, size : size + width])
         return torch.cat(pictures)
+
+
+def _common_shape(R: Tensor, position: Tensor, radius: Tensor) -> tuple[int, ...]:
+    """Return the leading shape of R (..., 3, 3), position (..., 3) and radius (...); raise ShapeError without one."""
+    shapes = R.shape[:-2], position.shape[:-1], radius.shape
+    try:
+        return np.broadcast_shapes(*shapes)
+    except ValueError as error:
+        got, do = ", ".join(str(tuple(one)) for one in shapes), "pass one position and radius for each, or for all"
+        expected = "leading shapes that agree of R_lab_body, position_mm and radius_mm"
+        raise ShapeError(refusal("renderer", expected=expected, got=got, do=do)) from error
 
 
 def orthographic_camera(size_px: int, mm_px: float) -> TelecentricCamera:

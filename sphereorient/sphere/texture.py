@@ -76,7 +76,9 @@ def load_unseen(texture: Path) -> Tensor | None:
     """
     with Image.open(texture) as picture:
         size = picture.height, picture.width
-        alpha = np.asarray(picture.getchannel("A")) if "A" in picture.getbands() else np.full(size, 255)
+        # A transparent grey level or index.
+        shown = picture.convert("RGBA") if "transparency" in picture.info else picture
+        alpha = np.asarray(shown.getchannel("A")) if "A" in shown.getbands() else np.full(size, 255)
     # Texels with alpha below this (of 255) are no paint.
     unseen, counts = torch.from_numpy(alpha < 128), read_seen(seen_path(texture))
     if counts is not None and counts.shape != unseen.shape:
@@ -88,6 +90,12 @@ def load_unseen(texture: Path) -> Tensor | None:
         do = "learn the map anew, or correct its alpha channel"
         raise TextureError(refusal(f"texture {texture}", expected="paint that some picture shows", got="none", do=do))
     return unseen if bool(unseen.any()) else None
+
+
+def load_known(texture: Path) -> Tensor:
+    """Read a map as `load_texture`, (H, 2 H) float32, with the texels of `load_unseen` as NaN."""
+    grey, unseen = load_texture(texture), load_unseen(texture)
+    return grey if unseen is None else grey.masked_fill(unseen, math.nan)
 
 
 def map_directions(height: int) -> Tensor:

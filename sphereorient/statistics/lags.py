@@ -133,11 +133,11 @@ def increments(
         frames = np.asarray(lags_s) / ensemble.step_s
     wanted = np.unique(np.clip(np.rint(frames).astype(np.int64), 1, max(pairs.longest, 1)))
     x = ensemble.values["omega_lab"]
-    sums, counts, lags = [], [], []
+    sums, counts, lags = list[Floats](), list[int](), list[int]()
     for lag in wanted.tolist():
         first, second = pairs.at(lag)
         segment = ensemble.segment[first]
-        if len(np.unique(segment)) < min(FEWEST_SEGMENTS, ensemble.segments):
+        if lags and len(np.unique(segment)) < min(FEWEST_SEGMENTS, ensemble.segments):
             continue
         d2 = np.square(x[second] - x[first])
         sums.append(segment_sums(np.stack([np.ones_like(d2), d2, d2 * d2], axis=-1), segment, ensemble.segments))

@@ -1,5 +1,6 @@
 """Share of noise in a quantity: by the track's sigmas, by increments over many lags, by the kernel's width."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -51,10 +52,14 @@ def multi_lag(tracks: Sequence[Trajectory], quantity: str, settings: BootstrapSe
     """Estimate the variance of "acceleration" or "alpha_lab" from the raw measurements, without their white noise.
     The second difference over n frames has variance (n dt)^4 <a^2> (1 - c n^2) + 6 times the noise variance; a linear
     fit over some lags n separates them. For alpha it is the difference of R_{k+n} R_k^T and R_k R_{k-n}^T. Raises
-    TrackError (too few segments for the fit).
+    TrackError (too few segments for the fit, or tracks of several frame rates).
     Source: Machicoane, Lopez-Caballero, Bourgoin, Aliseda and Volk 2017, Meas. Sci. Technol. 28, 107002.
     """
     step_s = float(np.median(np.concatenate([np.diff(t.time) for t in tracks])))
+    others = [_step(t) for t in tracks if len(t) > 1 and abs(_step(t) / step_s - 1) > 0.1]
+    if others:
+        expected, got = "tracks of one frame rate", f"steps of {step_s:.3g} and {others[0]:.3g} s"
+        raise TrackError(refusal("multi_lag", expected=expected, got=got, do="pass those of one rate"))
     sums = [np.concatenate([_second_differences(t, quantity, n, step_s) for t in tracks]) for n in LAGS]
     whole = np.stack(sums, axis=1)  # (S, L, 3, 2)
     whole = whole[(whole[..., 1] > 0).any((1, 2))]
@@ -128,12 +133,14 @@ def width_curve(
     widths_frames: Sequence[float] = WIDTHS,
     settings: BootstrapSettings | None = None,
 ) -> WidthCurve:
-    """Differentiate the measurements to velocity, acceleration or alpha_lab with Gaussian kernels (sigma, frames).
+    """Differentiate the measurements to velocity, acceleration or alpha_lab with Gaussian kernels (sigma, frames; of
+    tracks of several rates: frames of the slowest).
     Narrow kernels pass noise, wide ones remove motion; a plateau between them is the rms. All widths use the frames
     possible for the widest one; NaN if all segments are shorter. White noise and regular times are assumed.
     Source: Voth, La Porta, Crawford, Alexander and Bodenschatz 2002, J. Fluid Mech. 469, 121; the paper, section III.
     """
-    sums = np.concatenate([_by_width(track, quantity, widths_frames) for track in tracks])
+    step_s = max((_step(track) for track in tracks if len(track) > 1), default=math.nan)
+    sums = np.concatenate([_by_width(track, quantity, np.array(widths_frames) * step_s) for track in tracks])
     if not len(sums):
         sums = np.zeros((1, len(widths_frames), 3, 6))  # 0 / 0 is NaN
     found = studentized(sums.reshape(len(sums), -1, 6), _width_statistics, np.ones(5, bool), settings)
@@ -141,7 +148,7 @@ def width_curve(
     rows = np.arange(3 * len(widths_frames)).reshape(-1, 3)
     return WidthCurve(
         quantity=quantity,
-        width_s=np.array(widths_frames) * _step(tracks[0]),
+        width_s=np.array(widths_frames) * step_s,
         length_unit=tracks[0].length_unit,
         **{name: found.part((rows, k)) for k, name in enumerate(names)},
     )
@@ -151,10 +158,10 @@ def _step(track: Trajectory) -> float:
     return float(np.median(np.diff(track.time)))
 
 
-def _by_width(track: Trajectory, quantity: str, widths: Sequence[float]) -> Floats:
+def _by_width(track: Trajectory, quantity: str, widths_s: Floats) -> Floats:
     """Return by segment (S, W, 3, 6): number, x^2, x^4, sigma^2, sigma^4, x^2 sigma^2."""
-    if not (track.segment >= 0).any():
-        return np.zeros((0, len(widths), 3, 6))
+    if len(track) < 2 or not (track.segment >= 0).any():
+        return np.zeros((0, len(widths_s), 3, 6))
     rows, place, number = _grid(track)
     rotating = quantity == "alpha_lab"
     cov = (track.orientation_cov if rotating else track.position_cov * track.rate_scale**2)[rows]
@@ -170,7 +177,7 @@ def _by_width(track: Trajectory, quantity: str, widths: Sequence[float]) -> Floa
     order: Literal[1, 2] = 2 if quantity == "acceleration" else 1
     scale = _step(track) ** -(2 if quantity != "velocity" else 1)
     parts = []
-    for width in widths:
+    for width in (widths_s / _step(track)).tolist():
         kernel = gaussian_kernel(width, order).numpy()[::-1]  # reversed for `np.convolve`
         x2 = np.square(_convolved(values, kernel) * scale)
         s2 = _convolved(noise, np.square(np.convolve(kernel, CENTRAL) if rotating else kernel)) * scale**2

@@ -137,7 +137,7 @@ def _first_rows(whole: dict[str, NDArray[Any]], longest_s: float | None) -> NDAr
     time_s = whole["time_s"]
     first = np.ones(len(time_s), dtype=bool)
     first[1:] = (np.diff(whole["label"]) != 0) | (np.diff(whole["track"]) != 0)
-    if longest_s is not None:
+    if longest_s is not None and len(time_s):
         number, begin = np.cumsum(first) - 1, np.flatnonzero(first)
         span_s = time_s[np.append(begin[1:], len(time_s)) - 1] - time_s[begin]
         pieces = np.maximum(np.ceil(span_s / longest_s * (1 - 1e-9)), 1)

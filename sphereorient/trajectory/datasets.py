@@ -139,11 +139,13 @@ def runs_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def nearest_rows(known: NDArray[Any], wanted: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the rows of increasing known times nearest to the wanted ones, and where they are within half a step."""
+    """Return the rows of increasing known times nearest to the wanted ones, and where they are within half a step,
+    of whichever has the shorter ones.
+    """
     after = np.clip(np.searchsorted(known, wanted), 0, len(known) - 1)
     before = np.maximum(after - 1, 0)
     row = np.where(np.abs(known[before] - wanted) < np.abs(known[after] - wanted), before, after)
-    step = float(np.median(np.diff(known))) if len(known) > 1 else np.inf
+    step = min((float(np.median(np.diff(one))) for one in (known, wanted) if len(one) > 1), default=np.inf)
     return row, np.abs(known[row] - wanted) <= step / 2
 
 

@@ -12,7 +12,7 @@ import torch
 from typer.testing import CliRunner
 
 from sphereorient import so3
-from sphereorient.bench.ball import SCENES, BallErrors, walked, write_ball_scene
+from sphereorient.bench.ball import SCENES, BallErrors, BallRow, walked, write_ball_scene
 from sphereorient.cli import app
 from sphereorient.errors import SphereOrientError
 from sphereorient.experiment import load_experiment
@@ -84,6 +84,27 @@ def test_the_command_measures_a_scene_once(tmp_path):
     assert row["first"]["orientation_p95_deg"] < 0.3
     again = CliRunner().invoke(app, options)
     assert again.output.splitlines()[-8:] == done.output.splitlines()[-8:]
+
+
+def test_a_run_of_the_first_pass_is_not_taken_for_one_of_both(tmp_path, monkeypatch):
+    """Before: one file for both, so that the command printed the first pass alone, or ran nothing."""
+    turns = so3.exp(0.05 * torch.randn(50, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64))
+    errors = BallErrors.of(np.arange(50) / 100, turns.numpy(), np.tile(1e-6 * np.eye(3), (50, 1, 1)), turns.numpy())
+    asked = []
+
+    def measured(path: object, settings: object, refine: bool, progress: object) -> BallRow:
+        asked.append(refine)
+        return BallRow(first=errors, refined=errors if refine else None, cpu_ms=1.0, radius_px=9.0)
+
+    monkeypatch.setattr("sphereorient.bench.ball.write_ball_scene", lambda folder, *_: folder)
+    monkeypatch.setattr("sphereorient.bench.ball.measure_scene", measured)
+    (tmp_path / "run").mkdir()
+    options = ["bench", "ball", "--out", str(tmp_path / "run"), "--scenes", "clean_fly", "--quiet"]
+    for more in (["--first"], [], ["--first"], []):
+        assert CliRunner().invoke(app, options + more).exit_code == 0
+    assert asked == [False, True]
+    rows = [json.loads(path.read_text()) for path in sorted((tmp_path / "run").glob("*.json"))]
+    assert sorted("refined" in row for row in rows) == [False, True]
 
 
 def test_another_scene_is_refused(tmp_path):

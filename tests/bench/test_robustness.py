@@ -205,6 +205,16 @@ def test_lost_and_wrong_frames_count_as_worse():
     assert "wrong frames" in [change.what for change in compare_runs(wrong, before) if change.worse]
 
 
+def test_clean_scenes_alone_are_drawn():
+    """Before: an error of the figure, after all scenes had been tracked."""
+    clean = outcome(scene="clean-0-0-0", kind="clean", level=0, degradations={})
+    figure = robustness_figure(results(clean))
+    assert [axes.get_title() for axes in figure.subfigs[0].axes] == ["clean", ""]
+    assert len(figure.subfigs[0].axes[0].lines) == 2
+    mixed = robustness_figure(results(clean, outcome()))
+    assert mixed.subfigs[0].axes[0].get_title() == "defocus"
+
+
 def test_runs_of_other_plans_have_nothing_to_compare_runs():
     other = Results(settings=BenchSettings(frames=30), versions={}, outcomes=[outcome()])
     with pytest.raises(BenchError, match="none in common"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -131,15 +132,16 @@ def test_a_movie_turned_by_half_a_turn_is_deadly():
     assert found.advice == "write flip: {cam2: both}"
 
 
-@pytest.mark.parametrize("share", [-0.03, 0.03])
-def test_wide_pixels_are_named(share):
+@pytest.mark.parametrize(("share", "pitch"), [(-0.03, 3.1), (0.03, -2.9)])
+def test_wide_pictures_are_named_with_the_changes_of_sx_and_of_pixel_pitch(share, pitch):
     """Before: all frames valid, 0.5 degrees and 7.5 mm off, sigma 6 and 25 times too small."""
     wide = {name: replace(c, sx=c.sx * (1 + share)) for name, c in CAMERAS.items() if isinstance(c, TsaiCamera)}
     seen = seen_by(wide)  # type: ignore[arg-type]
     seen = replace(seen, radius_px=seen.radius_px * (1 + share / 2) / (1 + share))  # of the circle about the ellipse
     found = compare_cameras(reported(seen, CAMERAS), LIMITS)
     assert found.contradicts
-    assert f"pixels of cam1 and cam2 {100 * share:+.1f} % wider" in found.advice
+    named = re.search(r"pictures of cam1 and cam2 (\S+) % wider .* sx \((\S+) %\), .* u \((\S+) %\)", found.advice)
+    assert [float(number) for number in named.groups()] == pytest.approx([100 * share, 100 * share, pitch], abs=0.1)
 
 
 def test_outlines_that_are_wider_than_high_show_wide_pixels_and_no_wrong_diameter():
@@ -150,7 +152,7 @@ def test_outlines_that_are_wider_than_high_show_wide_pixels_and_no_wrong_diamete
         "the pictures fit sphere.diameter"
     )
     found = compare_cameras(replace(seen, outline_stretch=wide), LIMITS)
-    assert found.advice.startswith("pixels of cam1 and cam2 -3")
+    assert found.advice.startswith("pictures of cam1 and cam2 -3")
 
 
 @pytest.mark.parametrize(("late", "frames"), [(-3, 48), slow(1, 48), slow(2, 48), (7, 48), (2, 240)])

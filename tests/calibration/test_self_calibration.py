@@ -145,6 +145,17 @@ def test_too_few_frames_and_one_camera_are_refused(rng):
         self_calibrate(replace(seen, cameras={"cam1": calibrated["cam1"]}))
 
 
+def test_frames_of_three_cameras_are_counted_once(rng):
+    calibrated = default_cameras(SynthSettings(cameras=3))
+    assert self_calibrate(observations(calibrated, calibrated, rng, frames=24)).frames == 24
+    with pytest.raises(CameraError, match=r"20 frames or more in which cam2 and another camera .*, got 12"):
+        self_calibrate(observations(calibrated, calibrated, rng, frames=12))
+    seen = observations(calibrated, calibrated, rng, frames=36)
+    seen.centre_px[12:, 2] = torch.nan  # twelve frames in common with each of two cameras are twelve frames
+    with pytest.raises(CameraError, match=r"20 frames or more in which cam3 and another camera .*, got 12"):
+        self_calibrate(seen)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["cam1", "cam3"])
 def test_the_bumped_one_of_three_cameras_is_put_right_and_the_others_stay(rng, name):

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from calibration_examples import cameras
@@ -34,7 +36,7 @@ def wrong_cameras(rig, known, draw):
     made = {}
     for name, camera in rig.items():
         own = [k for k, label in enumerate(known.names) if label.startswith(f"{name}.")]
-        made[name] = with_parameters(camera, [known.names[k].partition(".")[2] for k in own], draw[own])
+        made[name] = with_parameters(camera, [known.names[k].rpartition(".")[2] for k in own], draw[own])
     return made
 
 
@@ -146,6 +148,38 @@ def test_frames_without_motion_have_systematic_errors_as_well(rng):
     direct = systematic_errors(rig, known, places[:1], RADIUS)
     quick = systematic_errors(rig, known, places, RADIUS)
     assert_close(quick[0][7] / direct[0][0], torch.ones(3, 3).double(), atol=1e-3)
+
+
+@pytest.mark.parametrize("kept", [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0)], ids=["point", "line", "plane"])
+def test_positions_at_one_point_or_in_a_plane_have_the_systematic_errors_of_each_alone(kept, rng):
+    rig, known = cameras(), covariance(rng)
+    places = 10 * (2 * torch.rand(300, 3, generator=rng, dtype=torch.float64) - 1)
+    places = places * torch.tensor(kept, dtype=torch.float64) + torch.tensor([1.2345678, 2.3, 3.1])
+    alone = systematic_errors(rig, known, places[7:8], RADIUS)
+    for one, all_frames in zip(alone, systematic_errors(rig, known, places, RADIUS), strict=True):
+        assert_close(all_frames[7] / one[0].diagonal().max(), one[0] / one[0].diagonal().max(), atol=1e-3)
+
+
+def test_systematic_errors_do_not_depend_on_what_memory_held_before(rng):
+    rig, known = cameras(), covariance(rng)
+    flat = 10 * torch.rand(300, 3, generator=rng, dtype=torch.float64) * torch.tensor([1.0, 1.0, 0.0])
+    found = set()
+    for k in range(20):
+        garbage = (torch.nan, 1e300)[k % 2]
+        held = [torch.full((1 + (97 * k + 31 * n) % 4000,), garbage, dtype=torch.float64) for n in range(30)]
+        del held
+        found.add(systematic_errors(rig, known, flat, RADIUS)[0].numpy().tobytes())
+    assert len(found) == 1
+
+
+def test_a_point_in_the_name_of_a_camera_changes_nothing(rng):
+    rig, plain = cameras(), covariance(rng)
+    place = torch.tensor([[5.0, 1.0, -3.0]], dtype=torch.float64)
+    expected = systematic_errors(rig, plain, place, RADIUS)
+    pointed = {f"side.{name[-1]}": camera for name, camera in rig.items()}
+    known = replace(plain, names=tuple(name.replace("cam", "side.") for name in plain.names)).of(pointed)
+    for one, other in zip(systematic_errors(pointed, known, place, RADIUS), expected, strict=True):
+        assert_close(one, other)
 
 
 def test_frames_without_a_position_have_no_systematic_error(rng):

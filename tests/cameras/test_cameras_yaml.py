@@ -10,7 +10,7 @@ import torch
 from camera_examples import MODELS, behind_port, f64, tsai, whole_picture
 from conftest import SHARED, assert_close
 
-from sphereorient.cameras import load_cameras, save_cameras
+from sphereorient.cameras import load_cameras, load_covariance, save_cameras
 from sphereorient.cameras.camera import ParameterCovariance
 from sphereorient.errors import CameraError
 
@@ -96,6 +96,9 @@ FAULTS = {
     "both foci": (PINHOLE.replace("vfov_deg: 45.0", "vfov_deg: 45.0, f_px: 3.0"), "exactly one, got both"),
     "no focus": (PINHOLE.replace("vfov_deg: 45.0, ", ""), "exactly one, got none"),
     "wide": (PINHOLE.replace("45.0", "181"), "cam1, vfov_deg: expected an angle"),
+    "name with a slash": (TSAI.replace("cam1:", "lab/left:"), "cameras: expected names without '/', got 'lab/left'"),
+    "name of a point": (TSAI.replace("cam1:", "'.':"), "cameras: expected names without '/', got '.'"),
+    "empty name": (TSAI.replace("cam1:", "'':"), "cameras: expected names without '/', got ''"),
     "a list": ("- 1\n- 2\n", "expected keys and values"),
     "no yaml": ("a: [1, 2\nb: }", "expected YAML"),
 }
@@ -108,6 +111,27 @@ def test_every_fault_is_one_line_that_names_the_file(tmp_path, text, message):
         load_cameras(path)
     assert str(path) in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_a_name_that_cannot_be_read_back_is_not_written(tmp_path):
+    with pytest.raises(CameraError, match="names without '/', got 'lab/left'"):
+        save_cameras(tmp_path / "cameras.yaml", {"lab/left": tsai()})
+    assert not list(tmp_path.iterdir())
+
+
+def covariance(variance: float, *names: str) -> ParameterCovariance:
+    return ParameterCovariance(names=names, matrix=variance * torch.eye(len(names), dtype=torch.float64))
+
+
+def test_cameras_outside_the_joint_covariance_add_their_own(tmp_path):
+    path, own = tmp_path / "cameras.yaml", covariance(4.0, "T_x", "T_z")
+    rig = {name: tsai(covariance=own) for name in ("cam1", "cam2", "cam3")}
+    save_cameras(path, rig, covariance=covariance(9.0, "cam1.T_x", "cam2.T_x"))
+    known = load_covariance(path, load_cameras(path))
+    assert known.names == ("cam1.T_x", "cam2.T_x", "cam3.T_x", "cam3.T_z")
+    assert_close(known.matrix, torch.diag(f64([9.0, 9.0, 4.0, 4.0])))
+    assert load_covariance(path, {"cam3": rig["cam3"]}).names == ("cam3.T_x", "cam3.T_z")
+    assert load_covariance(path, rig | {"cam3": tsai()}) is None  # not known is not exact
 
 
 def test_a_folder_that_is_not_there_is_made_on_writing(tmp_path):

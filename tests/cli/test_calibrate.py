@@ -178,6 +178,17 @@ def test_cameras_that_contradict_each_other_most_of_the_time_are_reported(contra
         assert "--refine-with" in lines[1]
 
 
+@pytest.mark.parametrize(("contradicts", "reported"), [(8, False), (90, True)])
+def test_contradictions_of_three_cameras_are_compared_with_frames_that_two_see(contradicts, reported):
+    calibrated = cameras()
+    track = track_of(calibrated, calibrated, contradicts)
+    third = replace(track.cameras["cam1"], reason=("not_found",) * (FRAMES - 10) + ("ok",) * 10)
+    lines = contradiction_lines(replace(track, cameras=track.cameras | {"cam3": third}))
+    assert bool(lines) is reported
+    if reported:
+        assert f"in {contradicts} of the {FRAMES} frames in which two or more see" in lines[0]
+
+
 def test_the_command_check_cameras_reads_a_track(tmp_path, monkeypatch, capsys):
     experiment = REPO / "synthetic_data"
     (path,) = sorted(experiment.rglob("experiment.yaml"))[:1]

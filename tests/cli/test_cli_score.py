@@ -228,6 +228,31 @@ def test_a_table_whose_counter_begins_anew_is_cut_there(on_a_ball, tmp_path):
     assert found["gain"]["value"][:3] == pytest.approx([1.0, 0.97, 1.0], abs=2e-3)
 
 
+def test_errors_are_aligned_between_the_counters_beginnings(on_a_ball, tmp_path):
+    """Before: one rotation for all frames, though the table's axes change there."""
+    table = fictrac_table(on_a_ball, FicTracAxes.of_lab(TURN))
+    turned = Rotation.from_rotvec(table[100:, 8:11]) * Rotation.from_rotvec(table[100, 8:11]).inv()
+    table[100:, 8:11], table[100:, 22] = turned.as_rotvec(), np.arange(100)
+    np.savetxt(tmp_path / "own.dat", table, delimiter=", ")
+    found = scored(tmp_path / "track.h5", tmp_path / "own.dat", "--align", "both")
+    assert (found["known"], found["pairs"]) == (200, 198)
+    assert found["error_deg"]["largest"] < 0.01
+    # A track without the frame where it begins anew is cut there as well.
+    on_a_ball.at(np.delete(np.arange(200), 100)).save(tmp_path / "fewer.h5")
+    fewer = scored(tmp_path / "fewer.h5", tmp_path / "own.dat", "--align", "both")
+    assert (fewer["known"], fewer["pairs"]) == (199, 197)
+    assert fewer["error_deg"]["largest"] < 0.01
+
+
+def test_lengths_in_radii_have_no_error_in_mm(track):
+    loaded = replace(Trajectory.load(track), length_unit="radii")
+    found = score_track(loaded, TRUTH)
+    assert np.isnan(found.position_mm).all()
+    assert found.valid.all()
+    assert "velocity" not in found.relative_rms
+    assert found.relative_rms.keys() >= {"omega_lab", "alpha_body"}
+
+
 def test_behaviour_is_printed_and_for_a_short_track_the_reason(on_a_ball, tmp_path):
     printed = CliRunner().invoke(app, ["score", str(tmp_path / "track.h5"), str(tmp_path / "truth.h5")]).output
     assert "0.9700" in printed

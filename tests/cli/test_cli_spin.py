@@ -96,6 +96,15 @@ def test_options_that_are_impossible_are_refused_in_one_line(flight, monkeypatch
     assert err.count("\n") == 1
 
 
+@pytest.mark.parametrize("rate", ["inf", "nan", "0", "1e7"])
+def test_a_fastest_spin_out_of_range_is_refused(flight, monkeypatch, capsys, rate):
+    """Before: inf ended in an OverflowError."""
+    code, _, err = command(monkeypatch, capsys, "spin", flight / "pictures", *options(flight), "--omega-max", rate)
+    assert code == 2
+    assert "Invalid value for '--omega-max'" in err
+    assert not (flight / "spin.json").exists()
+
+
 def test_too_few_photographs_and_missing_ones_are_refused(flight, monkeypatch, capsys):
     code, _, err = command(monkeypatch, capsys, "spin", flight / "pictures" / "0.png", *options(flight))
     assert code == 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import h5py
 import numpy as np
 import pytest
@@ -12,6 +13,10 @@ from typer.testing import CliRunner
 from sphereorient import so3
 from sphereorient.cli import app
 from sphereorient.errors import SphereOrientError
+from sphereorient.experiment.recording import TextureMap
+from sphereorient.files.whole_file import has_mark
+from sphereorient.run import Request
+from sphereorient.run.store import fingerprint
 from sphereorient.sphere import load_texture
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
@@ -60,6 +65,40 @@ def test_a_ball_that_rests_has_no_map(tmp_path):
     assert "rotates" in str(done.exception)
     assert not out.exists()
     assert not (path.parent / "own.png").exists()
+
+
+def test_an_interrupted_run_goes_on_with_the_map_that_it_learnt(tmp_path, monkeypatch):
+    """Before: --resume refused its own map; and once it was named in the file, that was another experiment."""
+    path, _ = experiment_of(tmp_path / "turns", 60.0)
+    content = yaml.safe_load(path.read_text())
+    del content["sphere"]["texture"]
+    path.write_text(yaml.safe_dump(content))
+    target = path.parent / "texture.png"
+    target.unlink()  # that of the renderer
+    asked, learnt = [], []
+
+    def first_map(*_: object) -> tuple[TextureMap, list[str]]:
+        learnt.append(1)
+        return TextureMap(grey=torch.rand(64, 128), unseen=None), []
+
+    def stopped(request: Request, *_: object, **more: object) -> None:
+        asked.append((fingerprint(request), request.experiment.texture_path, more["resume"]))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sphereorient.methods.map.first_map_of", first_map)
+    monkeypatch.setattr("sphereorient.run.stages.run_tracks", stopped)
+    run(path)
+    assert has_mark(target)
+    run(path, "--resume")
+    assert len(learnt) == 1
+    (first, path_1, _), (second, path_2, resume) = asked
+    assert resume
+    assert path_1 == path_2 == target
+    assert first == second
+    target.write_bytes(cv2.imencode(".png", np.zeros((64, 128), np.uint8))[1].tobytes())  # the user's own picture
+    done, _ = run(path, "--resume")
+    assert "write it under sphere: texture:" in str(done.exception)
+    assert len(asked) == 2
 
 
 def test_a_map_that_the_experiment_does_not_name_is_not_written_over(tmp_path):

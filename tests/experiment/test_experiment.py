@@ -125,6 +125,7 @@ FAULTS = {
     "neither": (SHORT.replace("frame_rate: 30", "name: none"), "times, got neither"),
     "a flip that there is not": (SHORT + "flip: {cam1: upside}\n", "flip.cam1"),
     "a response that falls": (SHORT + "response: [[0, 0], [90, 120], [255, 100]]\n", "response"),
+    "a response of one row": (SHORT + "response: [[0, 0]]\n", "response"),
     "a response that is no curve": (SHORT + "response: {gamma: bright}\n", "response"),
     "a response of no camera": (SHORT + "response: {cam7: srgb}\n", "got 'cam7'"),
     "a setting of a camera that there is not": (SHORT + "camera: {cam1: {triger: Line1}}\n", "'trigger'"),

@@ -186,3 +186,18 @@ def test_stamps_of_three_cameras_make_one_frame_whichever_pictures_each_lost(fol
     assert frames.rows["cam2"].tolist() == [0, NONE, 1, NONE, 2, 3]
     assert frames.rows["cam3"].tolist() == [0, 1, 2, 3, NONE, 4]
     np.testing.assert_allclose(frames.time_s, grid + np.array([2, 4, 2, 2, 1, 2]) * 1e-4, atol=1e-9)
+
+
+def test_an_exposure_longer_than_a_frame_is_refused_with_times_too(folder):
+    """Before: by a frame rate only; 0.4 s for 0.4 ms moved the poses of the track by half of it."""
+    (folder / "times.csv").write_text("\n".join(f"{k / 600!r}" for k in range(15)))
+    with pytest.raises(ExperimentError, match=r"exposure: expected at most .*0\.001667 s, got 0\.4") as refused:
+        line(folder, TABLE + "exposure: 0.4\n")
+    assert "\n" not in str(refused.value)
+    assert len(line(folder, TABLE + "exposure: 0.0004\n")) == 12
+    # A camera of half the rate may expose for two frames of the other one.
+    save_stamped(folder / "cam1.h5", [0.02 * k for k in range(10)])
+    save_stamped(folder / "films" / "cam2.h5", [0.04 * k for k in range(5)])
+    assert len(line(folder, STAMPED + "exposure: 0.03\n")) == 10
+    with pytest.raises(ExperimentError, match=r"0\.04 s, got 0\.05"):
+        line(folder, STAMPED + "exposure: 0.05\n")

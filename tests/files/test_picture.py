@@ -8,6 +8,7 @@ import zlib
 import cv2
 import numpy as np
 import pytest
+import tifffile
 
 from sphereorient.errors import TextureError
 from sphereorient.files.picture import BOMB_PIXELS, claimed_pixels, decoded, decoded_grey
@@ -72,3 +73,24 @@ def test_where_a_size_stands_twice_the_decoders_counts(kind, tmp_path):
     (tmp_path / "map.tif").write_bytes(sized_twice(kind, (30_000, 15_000), (64, 32)))
     with pytest.raises(TextureError, match=r"33\.6 million pixels"):
         load_texture(tmp_path / "map.tif")
+
+
+@pytest.mark.parametrize("kind", ["white is zero", "colour planes"])
+def test_sixteen_bits_that_the_decoder_would_garble_are_refused(kind, tmp_path):
+    deep, path = np.repeat(GREY[:, :1].astype(np.uint16), 24, 1) * 257, tmp_path / "map.tif"
+    if kind == "white is zero":
+        tifffile.imwrite(path, 65535 - deep, photometric="miniswhite")
+    else:
+        tifffile.imwrite(path, np.stack([deep] * 3), photometric="rgb", planarconfig="separate")
+    assert decoded_grey(path.read_bytes()) is None
+    with pytest.raises(TextureError, match="does not decode"):
+        load_texture(path)
+    assert decoded_grey(path.read_bytes()[:40]) is None
+
+
+def test_eight_bits_with_white_as_zero_or_in_colour_planes_are_read(tmp_path):
+    path = tmp_path / "map.tif"
+    tifffile.imwrite(path, 255 - GREY, photometric="miniswhite")
+    np.testing.assert_array_equal(decoded_grey(path.read_bytes()), GREY)
+    tifffile.imwrite(path, np.stack([GREY] * 3), photometric="rgb", planarconfig="separate")
+    np.testing.assert_array_equal(decoded_grey(path.read_bytes()), GREY)

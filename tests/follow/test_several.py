@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
 import pytest
 import torch
-from several_examples import FRAMES, write_several
+import yaml
+from several_examples import DIAMETER_MM, FRAMES, write_several
 
 from sphereorient import so3
+from sphereorient.cameras import perspective_centre_lab_mm
+from sphereorient.errors import TrackError
 from sphereorient.experiment.recording import open_recording
-from sphereorient.follow.tracker import Tracker
+from sphereorient.files.picture import write_picture
+from sphereorient.follow.tracker import Tracker, among_found
 from sphereorient.locate import screened_frames
 from sphereorient.methods import precise
 from sphereorient.methods.method import Job, load_learnt, one_thread, read_poses
@@ -155,3 +160,38 @@ def test_another_ball_found_in_its_place_is_not_joined_to_it(tracks, movie):
     first, other = names[0], names[-1]
     assert first != other
     assert names == first * 8 + "-" + other * 11
+
+
+def test_a_ball_found_behind_another_is_hidden_in_that_camera(tracks, movie):
+    learnt = load_learnt(movie.experiment.with_name("learnt.h5"))
+    with open_recording(movie.experiment) as recording, one_thread():
+        job = Job(recording=recording, settings=load_settings(None, (CHUNK,)), device=torch.device("cpu"))
+        balls = precise.resume(job, learnt).tracker.balls
+        searches = {name: tracker.search for name, tracker in balls.items()}
+        views = searches["b"].fitter.views
+        frame = [next(screened_frames(s, v.background, 0, 1)) for s, v in zip(recording.streams, views, strict=True)]
+        (found,) = Tracker(balls).start(frame, ["b"], {}, {}).values()
+    assert found.use.all()
+    eye = perspective_centre_lab_mm(views[0].camera, found.position_lab_mm)
+    toward = torch.nn.functional.normalize(eye - found.position_lab_mm, dim=-1)
+    before = replace(found, position_lab_mm=found.position_lab_mm + 2 * DIAMETER_MM * toward)
+    seen = balls["b"].looked_past(found, frame, among_found([("b", {"a": before})], searches))
+    assert seen.use.tolist() == [False, True, True]
+    assert seen.reason == (Reason.HIDDEN, Reason.OK, Reason.OK)
+
+
+def test_learnt_results_take_mask_and_response_of_the_experiment(tracks, movie):
+    learnt = load_learnt(movie.experiment.with_name("learnt.h5"))["a"]
+    keys = yaml.safe_load(movie.experiment.read_text())
+    mask = np.full((260, 260), 255, np.uint8)
+    mask[:, :120] = 0
+    write_picture(movie.experiment.with_name("mask.png"), mask)
+    masked = movie.experiment.with_name("masked.yaml")
+    masked.write_text(yaml.safe_dump(keys | {"masks": {"cam1": "mask.png"}}))
+    with open_recording(masked) as recording:
+        first, *others = learnt.appearance(recording.of("a")).fitter.views
+    assert np.array_equal(first.background.shown, mask > 0)
+    assert all(view.background.shown is None for view in others)
+    masked.write_text(yaml.safe_dump(keys | {"response": {"cam1": "srgb"}}))
+    with open_recording(masked) as recording, pytest.raises(TrackError, match="response of cam1: expected srgb"):
+        learnt.appearance(recording.of("a"))

@@ -204,3 +204,12 @@ def test_subsets_come_by_decreasing_size():
 def test_frames_that_are_followed_back_have_rising_times():
     (back,) = mirrored([range(3, 6)], [0.0, 0.1, 0.2, 0.3, 0.5, 0.8])
     assert [back.time_s[frame] for frame in range(back.first, back.first + 3)] == [-0.8, -0.5, -0.3]
+
+
+def test_each_pose_keeps_the_own_rotation_of_the_camera_in_use():
+    one, other = part(0.0, 1), part(0.3, 1)
+    parts = {name: torch.cat([value, value]) for name, value in one.parts().items()}
+    parts["R_lab_body"] = so3.exp(f64([[0.0] * 3, [1.5, 0.0, 0.0]]))
+    found = cameras_disagree([Poses(**parts, use=one.use, reason=one.reason), other], [(0,), (1,)])
+    assert_close(found.own_turn[:, 0], torch.zeros(2, 3, dtype=torch.float64))
+    assert_close(found.own_turn[:, 1, 0], f64([0.3, -1.2]))

@@ -26,7 +26,7 @@ from sphereorient.experiment.recording import Recording, open_recording
 from sphereorient.live.feed import Feed
 from sphereorient.live.live import measured
 from sphereorient.live.sources import source_of
-from sphereorient.movies import open_movie
+from sphereorient.movies import open_movie, write_movie
 
 HEIGHT = WIDTH = 650
 FEATURES = {
@@ -437,7 +437,8 @@ def test_a_movie_with_a_rotation_tag_comes_as_track_reads_it(angle, tmp_path):
     read = next(movie.frames())
     assert abs(read.astype(int) - ramp).mean() < 15, "of limited range"
     fake = SimpleNamespace(name="cam1", movie=movie)
-    recording = SimpleNamespace(streams=[fake], experiment=SimpleNamespace(devices={}, flip={}))
+    about = SimpleNamespace(devices={}, flip={})
+    recording = SimpleNamespace(streams=[fake], experiment=about, timeline=SimpleNamespace(frame_s=0.04))
     found = list(source_of(f"camera:{path}", print).frames(recording))
     assert len(found) == 3, "a movie ends"
     assert abs(found[0].pictures[0].astype(int) - read).mean() < 15
@@ -504,3 +505,37 @@ def test_pylons_own_emulation_behaves_as_the_fake(alone, monkeypatch):
     assert found[2].pictures[0].shape == (HEIGHT, WIDTH)
     with pytest.raises(MovieError, match=r"AcquisitionFrameRateAbs 5000000000\.0"):
         next(source_of("pylon:0815-0000", print).frames(with_keys(alone, cam1=DeviceKeys(rate_hz=5e9))))
+
+
+def test_the_frames_of_a_movie_file_have_the_rate_of_the_experiment(tmp_path):
+    path = tmp_path / "movie.mkv"
+    write_movie(path, [np.full((64, 64), k, np.uint8) for k in range(20)])
+    fake = SimpleNamespace(name="cam1", movie=open_movie(path))
+    about = SimpleNamespace(devices={}, flip={})
+    recording = SimpleNamespace(streams=[fake], experiment=about, timeline=SimpleNamespace(frame_s=0.04))
+    source = source_of(f"camera:{path}", print)
+    assert source.even
+    feed, found, late_s = Feed(source.frames(recording), most=64, wait=source.waits), [], []
+    for one in feed:
+        late_s.append(time.perf_counter() - one.arrived_s)
+        found.append((one.number, one.time_s))
+        time.sleep(0.01)  # it is tracked; meanwhile further ones are decoded
+    assert found == [(k, pytest.approx(0.04 * k)) for k in range(20)]
+    assert max(late_s) < 0.01, "waiting in line is no latency"
+
+
+def test_a_camera_of_opencv_that_opens_and_gives_no_picture_is_refused(alone, monkeypatch):
+    opencv(monkeypatch, Capture([]))
+    with pytest.raises(MovieError, match="camera:0: expected pictures, got none; end other programs"):
+        list(source_of("camera:0", print).frames(alone))
+
+
+def test_sizes_that_differ_by_some_px_are_set(maker, alone, monkeypatch):
+    camera = body([(grey(1), 1.0, 1)], Width=WIDTH + 6, Height=HEIGHT - 4, OffsetX=0, OffsetY=0)
+    camera.set = lambda name, value: camera.features.update({name: 200 if value == 202 else value})
+    install(maker, [camera, body(serial="9")], monkeypatch)
+    next(source_of(f"{maker}4711", print).frames(with_keys(alone, cam1=DeviceKeys(rate_hz=30.3))))
+    assert (camera.features["Width"], camera.features["Height"]) == (WIDTH, HEIGHT)
+    assert camera.features["AcquisitionFrameRate"] == 30.0, "within what devices round"
+    with pytest.raises(MovieError, match=r"OffsetX 202 \(it is 200\)"):
+        next(source_of(f"{maker}4711", print).frames(with_keys(alone, cam1=DeviceKeys(offset=(202, 0)))))

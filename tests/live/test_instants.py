@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -234,3 +234,15 @@ def test_several_cameras_need_clocks():
     instants.take(1, raw)
     with pytest.raises(MovieError, match="cam2: expected time stamps"):
         instants.take(1, raw)
+
+
+def test_pictures_that_cameras_lose_one_after_the_other_are_no_lost_instants():
+    """On the way are lost: of cam2 picture 60, of cam1 picture 61, of both picture 70."""
+    both = []
+    for camera in (0, 1):
+        for _, k, raw in times(camera, (0.01 * np.arange(100)).tolist(), 500.0 * camera):
+            if (camera, k) not in [(1, 60), (0, 61), (0, 70), (1, 70)]:
+                both.append((camera, k, replace(raw, counter=k + 1)))
+    found = list(played(sorted(both, key=lambda one: one[2].arrived_s), 2, []))
+    assert [triggers(one) for one in found[60:63]] == [[60, None], [None, 61], [62, 62]]
+    assert [one.number for one in found[20:]] == [k for k in range(20, 100) if k != 70]

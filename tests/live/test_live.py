@@ -1,5 +1,6 @@
 """Frame by frame: the same poses as a whole run, and the whole command."""
 
+import json
 import math
 import os
 import re
@@ -21,7 +22,12 @@ from sphereorient.cli import app
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording
 from sphereorient.follow.ball import BallTracker
+from sphereorient.live.feed import Feed
+from sphereorient.live.lines import FicTracLines, Forms, Quantities
+from sphereorient.live.loop import open_live
 from sphereorient.live.sources import movie_frames
+from sphereorient.methods.settings import Settings
+from sphereorient.trajectory.walk import FICTRAC, FicTracAxes
 
 
 def test_frames_one_by_one_are_as_good_as_a_whole_run_and_a_black_out_is_reported(tmp_path_factory):
@@ -145,6 +151,40 @@ def test_unknown_outputs_and_sources_of_live_are_refused(options, message, monke
     run = CliRunner().invoke(app, ["live", str(EXCERPT / "experiment.yaml"), *options])
     assert run.exit_code != 0
     assert message in str(run.exception)
+
+
+def test_a_refused_output_leaves_no_output_of_the_ones_before(tmp_path):
+    ring = tmp_path / "poses"
+    command = ["live", str(EXCERPT / "experiment.yaml"), "--to", f"shared:{ring}", "--to", str(tmp_path / "walk.dta")]
+    run = CliRunner().invoke(app, command)
+    assert "expected tcp:PORT" in str(run.exception)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("names", ["cam2,cam1", "cam1,cam1", "cam1,cam2,cam1"])
+def test_cameras_in_another_order_than_their_devices_are_refused(names, monkeypatch):
+    """Devices are paired with cameras in the order of the movies."""
+    monkeypatch.setattr("sphereorient.methods.precise.learn", lambda job, progress: pytest.fail("too late"))
+    command = ["live", str(EXCERPT / "experiment.yaml"), "--source", "pylon:B,A", "--cameras", names]
+    run = CliRunner().invoke(app, command)
+    expected = "cam1" if names == "cam1,cam1" else "cam1, cam2"
+    words = f"--cameras: expected the order of movies: {expected}, got {names.replace(',', ', ')}; write them"
+    assert words in str(run.exception)
+
+
+def test_frames_of_a_part_of_the_movies_keep_their_numbers_and_none_is_dropped(tmp_path_factory):
+    experiment = replace(load_experiment(EXCERPT / "experiment.yaml"), frames=(5, 9))
+    with open_live(experiment, Settings(), None, known(tmp_path_factory)) as opened:
+        feed = Feed(movie_frames(opened.recording, paced=False), 8, wait=True)
+        found = followed(opened, feed)
+    table, quantities = FicTracLines(FicTracAxes.of_lab(np.eye(3))), Quantities(fixed=False)
+    forms = [Forms(now, table, quantities) for now in found]
+    assert [one.columns[FICTRAC["frame"]] for one in forms] == [5, 6, 7, 8]
+    assert [json.loads(one.json)["frame"] for one in forms] == [5, 6, 7, 8]
+    assert [now.dropped for now in found] == [0] * 4
+    assert feed.dropped == 0
+    for now in found:
+        assert off_deg(now, now.number) < 0.2
 
 
 @pytest.mark.slow  # a program of its own, and its ball

@@ -10,6 +10,7 @@ from pathlib import Path
 from threading import Event, Thread
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from live_examples import LIMIT_S, until
 
@@ -359,6 +360,19 @@ def test_lsl_times_are_those_of_the_source_less_the_least_delay(monkeypatch):
         clock.now_s = 100.0 + 1e-3 * k + late_s + 0.002
         stream.send(numbers(k))
     assert pushed == pytest.approx([100.004, 100.001, 100.002, 100.003])
+
+
+def test_lsl_times_go_on_where_the_source_begins_again(monkeypatch):
+    pytest.importorskip("pylsl", reason="the extra `live`")
+    pushed: list[float] = []
+    clock = SimpleNamespace(now_s=100.0)
+    stream = LslOutput("ball", pytest.fail)
+    monkeypatch.setattr("pylsl.local_clock", lambda: clock.now_s)
+    monkeypatch.setattr("pylsl.StreamOutlet.push_sample", lambda self, values, time_s: pushed.append(time_s))
+    for k in (*range(900), *range(90)):
+        clock.now_s += 0.001
+        stream.send(numbers(k))
+    assert np.diff(pushed) == pytest.approx(np.full(989, 0.001))
 
 
 @pytest.mark.parametrize(

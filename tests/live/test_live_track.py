@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from typer.testing import CliRunner
 
 from sphereorient.cli import app
 from sphereorient.errors import OutputError, TrackError
+from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import open_recording
 from sphereorient.live.lines import FicTracLines, Forms, Quantities
 from sphereorient.live.live import REMARK, TrackBlocks
@@ -194,3 +196,33 @@ def test_after_kill_9_what_was_measured_is_read_as_a_track(tmp_path):
     run = CliRunner().invoke(app, ["export", str(path), "--to", "csv", "--out", str(tmp_path / "track.csv")])
     assert run.exit_code == 0, run.output
     assert not path.exists()
+
+
+def test_the_track_states_the_errors_that_last_of_the_frame_not_of_the_time_of_writing(run):
+    """A map that is learnt live states other errors at each frame; the rows of a frame may be written later."""
+    learnt = [replace(now, lasting=1e-3 * (1 + now.number) * np.eye(6)) for now in run[2]]
+    track = blocks_of(run).block(learnt)
+    for now in learnt:
+        if now.valid:
+            expected = now.covariance + now.lasting
+            np.testing.assert_allclose(track.orientation_cov[now.number], expected[:3, :3], rtol=1e-9, atol=1e-15)
+            np.testing.assert_allclose(track.position_cov[now.number], expected[3:, 3:], rtol=1e-9, atol=1e-15)
+    assert np.isnan(track.orientation_cov[[*HIDDEN, *DROPPED]]).all()
+
+
+def test_a_map_that_is_to_be_learnt_is_no_input_of_the_track_and_a_refused_track_leaves_no_journal(tmp_path):
+    path = tmp_path / "track.h5"
+    experiment = load_experiment(EXCERPT / "experiment.yaml").with_sphere(texture_path=tmp_path / "own.png")
+    with open_recording(experiment, textured=False) as recording:
+        output = TrackOutput(path, pytest.fail)
+        blocks = TrackBlocks(recording, SimpleNamespace(), even=True, settings=Settings(), command="sphereorient live")
+        output.begin(blocks)
+        output.close()
+        assert not any("own.png" in name for name in Trajectory.load(path).provenance["sha256"])
+        path.unlink()
+        output = TrackOutput(path, pytest.fail)
+        blocks = replace(blocks, recording=replace(recording, experiment=replace(experiment, path=tmp_path / "gone")))
+        with pytest.raises(FileNotFoundError):
+            output.begin(blocks)
+        output.close()
+    assert list(tmp_path.iterdir()) == []

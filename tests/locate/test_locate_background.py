@@ -11,7 +11,7 @@ from locate_examples import BACK, SETTINGS, Paint, blobs, filmed, plant, white
 from sphereorient.errors import ExperimentError
 from sphereorient.experiment.recording import load_background, spread_frames
 from sphereorient.locate import learn_background
-from sphereorient.locate.background import measure_background, without_ball
+from sphereorient.locate.background import measure_background, saturated, without_ball
 from sphereorient.locate.outline import find_blobs
 
 SHAPE = (150, 190)
@@ -256,3 +256,12 @@ def test_glitter_stays_hidden_also_where_no_ball_is_found():
     frames[:, 40:100, 60:120] = rng.integers(60, 250, (24, 60, 60))
     background = learn_background(frames, 60.0, SETTINGS, np.full(SHAPE, BACK, np.float32))
     assert np.median(background.noise[45:95, 65:115]) > 40
+
+
+def test_a_brighter_level_than_the_full_scale_shows_that_it_is_larger():
+    """12 bit: the frames from which the background was learnt did not show the bright ball."""
+    background = measure_background(np.full((3, 20, 20), 120, np.uint16))
+    assert background.full_scale == 1023
+    assert saturated(np.array([120, 1100, 2600, 2600], np.uint16), background) == 0
+    assert saturated(np.array([120, 1100, 4095, 4095], np.uint16), background) == 0.5
+    assert saturated(np.array([120, 900, 1023, 1023], np.uint16), background) == 0.5

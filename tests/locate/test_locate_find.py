@@ -1,11 +1,15 @@
+import cv2
 import numpy as np
 import pytest
 import torch
+import yaml
 from locate_examples import BACK, DIAMETER, SETTINGS, blobs, distance_px, even_background, filmed, plant, white
 
-from sphereorient.errors import ShapeError
-from sphereorient.locate import LocateSettings, Sightings, find_ball, sightings_of
-from sphereorient.locate.outline import Outline
+from sphereorient import track_movies
+from sphereorient.errors import ExperimentError, SettingsError, ShapeError
+from sphereorient.experiment.recording import open_recording
+from sphereorient.locate import Background, LocateSettings, Sightings, find_ball, find_scenes, sightings_of
+from sphereorient.locate.outline import Outline, find_blobs
 from sphereorient.trajectory import Reason
 
 WIDE = (240, 320)
@@ -155,3 +159,63 @@ def test_sightings_of_unequal_lengths_are_refused(part):
     assert len(Sightings(**parts)) == 3
     with pytest.raises(ShapeError, match="one row a frame"):
         Sightings(**(parts | {part: parts[part][:2]}))
+
+
+@pytest.mark.parametrize(("diameter", "reduction"), [(18.0, 8), (9.0, 4), (20.0, 8)])
+def test_a_small_ball_is_found_in_a_much_reduced_picture(diameter, reduction):
+    row, column = np.mgrid[:480, :640]
+    shown = np.hypot(column - 300.3, row - 200.6) < diameter / 2
+    frame = np.where(shown, 180, 30).astype(np.uint8)
+    background = Background(
+        mean=np.full(frame.shape, 30, np.float32), noise=np.ones(frame.shape, np.float32), full_scale=255.0
+    )
+    (first, *_) = find_blobs(
+        background.difference(frame), background.noise, diameter, LocateSettings(reduction=reduction)
+    )
+    assert np.hypot(first.u_px - 300.3, first.v_px - 200.6) < diameter / 2
+
+
+def experiment_of_two(folder, frames, keys=""):
+    """Write an experiment of one camera and two balls of 80 px."""
+    np.save(folder / "cam1.npy", frames)
+    cv2.imwrite(str(folder / "texture.png"), np.random.default_rng(0).integers(0, 255, (64, 128)).astype(np.uint8))
+    camera = {"model": "pinhole", "image_size": [320, 240], "f_px": 1500.0, "centre": [159.5, 119.5]}
+    camera |= {"R": np.eye(3).tolist(), "T": [0, 0, 340]}
+    cameras = {"schema": "sphereorient-cameras/1", "cameras": {"cam1": camera}}
+    ball = {"diameter": 18.0, "texture": "texture.png"} | ({"fixed": keys} if keys else {})
+    document = {"schema": "sphereorient-experiment/1", "cameras": "cameras.yaml", "movies": {"cam1": "cam1.npy"}}
+    document |= {"frame_rate": 100.0, "spheres": {"a": ball, "b": ball}}
+    (folder / "cameras.yaml").write_text(yaml.safe_dump(cameras))
+    (folder / "experiment.yaml").write_text(yaml.safe_dump(document))
+    return folder / "experiment.yaml"
+
+
+def two_balls(count):
+    """Frames of two painted balls that sway by 2 px before a scene of 30."""
+    rng = np.random.default_rng(0)
+    row, column = np.mgrid[: WIDE[0], : WIDE[1]]
+    paint = [cv2.GaussianBlur(rng.standard_normal((600, 600)), (0, 0), 8) > 0 for _ in range(2)]
+    for k in range(count):
+        grey = np.full(WIDE, 30.0)
+        for n, (u, v) in enumerate(((85, 120), (235, 118))):
+            far = np.hypot(column - u - 2 * np.sin(0.3 * k + n), row - v - 2 * np.cos(0.21 * k))
+            turned = paint[n][100 + 4 * k :][: WIDE[0], 100 : 100 + WIDE[1]]
+            grey = np.where(far < 40, np.where(turned, 190, 50), grey)
+        yield np.clip(grey + rng.standard_normal(WIDE), 0, 255).astype(np.uint8)
+
+
+def test_several_balls_in_place_are_all_missing_in_the_background(tmp_path):
+    with open_recording(experiment_of_two(tmp_path, np.stack(list(two_balls(60))), "sways")) as recording:
+        scene = next(iter(find_scenes(recording, recording.streams[0], 32, LocateSettings()).values()))
+    row, column = np.mgrid[: WIDE[0], : WIDE[1]]
+    for u, v in ((85, 120), (235, 118)):
+        inside = np.hypot(column - u, row - v) < 34
+        assert scene.background.mean[inside].mean() == pytest.approx(30, abs=3)
+
+
+def test_one_picture_of_several_balls_is_refused(tmp_path):
+    path = experiment_of_two(tmp_path, np.stack(list(two_balls(1))))
+    with open_recording(path) as recording, pytest.raises(SettingsError, match="got one picture"):
+        find_scenes(recording, recording.streams[0], 32, LocateSettings())
+    with pytest.raises(ExperimentError, match="expected one ball, got a, b"):
+        track_movies(path, method="paper")

@@ -8,7 +8,7 @@ import torch
 from sphereorient import so3
 from sphereorient.files.threads import silent
 from sphereorient.mapping import LearntMap
-from sphereorient.mapping.balls import shared_maps
+from sphereorient.mapping.balls import corrected, shared_maps
 from sphereorient.sphere.compare import turned_map
 from sphereorient.sphere.texture import map_directions, random_texture
 from sphereorient.synth import SynthSettings
@@ -65,3 +65,12 @@ def test_the_map_that_they_share_shows_more_and_has_less_noise(maps):
     assert float(error[1] / error[0]) < 0.9
     assert float(joined.sigma[both].median()) == pytest.approx(SIGMA / 2**0.5, rel=0.05)
     assert bool((joined.texture.isfinite() == (joined.seen > 0)).float().mean() > 0.99)
+
+
+def test_paint_that_neither_the_old_map_nor_the_new_one_knows_stays_unknown():
+    paint, height = random_texture("blobs", 3, ROWS).double(), map_directions(ROWS)[..., 2]
+    new, _, share = corrected(learnt(paint, 1), torch.where(height > 0.9, torch.nan, paint).float())
+    unknown = new.texture.isnan()
+    assert bool(unknown[height > 0.95].all())
+    assert not bool(unknown[height < 0.85].any())
+    assert share == pytest.approx(0.05, abs=0.02)  # of the sphere, from 0.8 to 0.9

@@ -1,6 +1,7 @@
 import math
 
 import pytest
+import renders
 import torch
 from renders import SIZE, disks_of_pictures, error_deg, pictures, turning
 
@@ -139,3 +140,13 @@ def test_paint_that_is_never_seen_twice_is_refused():
     keys = turns_of(R, torch.arange(7), torch.arange(1, 8))
     with pytest.raises(PaintError, match="seen twice"):
         close_loops(disks_of_pictures(whole), R, keys, MapSettings(keyframe_deg=11.0, score_min=0.8))
+
+
+@pytest.mark.slow
+def test_a_third_camera_of_another_ball_is_refused(monkeypatch):
+    third = torch.tensor([[[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]], dtype=torch.float64)
+    monkeypatch.setattr(renders, "R_LAB_VIEWS", torch.cat([renders.R_LAB_VIEWS, third]))
+    whole = pictures(turning(16, 8.0, (0.4, 0.7, -0.5)), 3)
+    other = pictures(turning(16, 8.0, (-0.9, 0.1, 0.3)), 3, seed=9)
+    whole[:, 2] = other[:, 2]
+    assert "one ball in both movies" in refused(whole)

@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import h5py
@@ -21,9 +22,10 @@ from sphereorient.bench.ball import SCENES, write_ball_scene
 from sphereorient.cameras import Camera, CoarserCamera, PinholeCamera, centre_lab_mm
 from sphereorient.experiment import load_experiment
 from sphereorient.files.whole_file import writing
-from sphereorient.locate import Frame
-from sphereorient.mapping import paint_cells
-from sphereorient.mapping.adjustment import focal_ratio
+from sphereorient.locate import Background, CameraScene, Frame
+from sphereorient.mapping import first_pass, paint_cells
+from sphereorient.mapping.adjustment import LEVELS, adjusted, focal_ratio
+from sphereorient.mapping.disks import Crops, cut_out
 from sphereorient.mapping.first_pass import CoarserPictures, FirstPass, KeptFrames
 from sphereorient.mapping.paint_cells import BallView, PaintCells
 from sphereorient.methods.map import first_map_of
@@ -34,8 +36,9 @@ from sphereorient.pose.poses import Poses, supported
 from sphereorient.report.texture_map import write_map
 from sphereorient.run import MemoryStore, Request
 from sphereorient.run.stages import run_tracks
-from sphereorient.sphere import load_texture
+from sphereorient.sphere import SphereRenderer, load_texture
 from sphereorient.sphere.compare import compare_maps
+from sphereorient.sphere.texture import random_texture
 from sphereorient.sphere.texture_table import octahedral_directions
 from sphereorient.trajectory import Reason
 
@@ -169,6 +172,34 @@ def test_a_ball_that_has_turned_far_unseen_is_found_again(ball):
     assert float(so3.geodesic_distance(again.R_lab_body[0], ball.R[far] @ ball.R[0].mT)) < 0.05
 
 
+@pytest.mark.parametrize("hidden", ["beside the picture", "behind the mask"])
+def test_a_camera_that_does_not_show_the_ball_does_not_stop_the_other(ball, hidden):
+    view = ball.place.views[0]
+    camera, scene = view.camera, view.scene
+    if hidden == "beside the picture":
+        camera = replace(camera, centre_px=camera.centre_px + 1000.0)
+    else:
+        mask = np.zeros(scene.background.mean.shape, bool)
+        scene = replace(scene, background=replace(scene.background, shown=mask))
+    views = [view, CameraView.of("cam2", camera, scene)]
+    follower = FirstPass(replace(ball.place, views=views, position_lab_mm=ball.X[:1]))
+    there = ball.X[0], torch.tensor([True, False])
+    found = [follower.next(k / RATE_HZ, [ball.frames[k]] * 2, there)[0] for k in range(8)]
+    assert all(map(supported, found))
+    R = torch.cat([poses.R_lab_body for poses in found])
+    assert float(error_deg(R, ball.R[:8] @ ball.R[0].mT).max()) < 1.0
+
+
+def test_only_frames_of_the_first_pass_count_as_showing_the_ball(ball, monkeypatch):
+    place = replace(ball.place, fixed=False, position_lab_mm=ball.X, seen=torch.ones(70, 1, dtype=torch.bool))
+    found = followed(ball, range(12), replace(ball.place, position_lab_mm=ball.X[:1]))
+    done = SimpleNamespace(turned_rad=1.0, adjusted=lambda _: "adjusted")
+    monkeypatch.setattr(first_pass, "FOLLOWED", 12)
+    monkeypatch.setattr(first_pass, "swept", lambda *_: (found, done))
+    recording = SimpleNamespace(timeline=range(70))
+    assert first_pass.first_adjustment(recording, place, lambda *_: None) == "adjusted"
+
+
 def kept(ball, place) -> KeptFrames:
     follower, frames = FirstPass(place), KeptFrames(place)
     for k, frame in enumerate(ball.frames):
@@ -188,6 +219,39 @@ def test_place_and_turns_are_adjusted_together(ball):
     assert abs(sizes[0] / sizes[1] - 1) < 0.003  # of 0.01
     body = so3.nearest_rotation((found.R_lab_body.mT @ ball.R).mean(0))
     assert float(error_deg(found.R_lab_body @ body, ball.R).median()) < 0.1
+
+
+def test_the_light_is_that_of_all_frames_though_a_mask_hides_much_of_the_first():
+    """Before: the light was 0 where the first frame hides the ball; residuals of 4 times the paint."""
+    size, behind, texture = (140, 100), 20.0, random_texture("blobs", 1, 128)
+    camera = PinholeCamera(
+        image_size=size,
+        R_cam_lab=torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]).double(),
+        T_cam_lab_mm=torch.tensor([0.0, 0, 500.0]).double(),
+        centre_px=torch.tensor([69.5, 49.5]).double(),
+        f_px=torch.tensor(1250.0).double(),
+    )
+    shown = np.ones((100, 140), bool)
+    shown[:, :55] = False
+    scene = Background(
+        mean=np.full((100, 140), behind, np.float32),
+        noise=np.ones((100, 140), np.float32),
+        full_scale=math.inf,
+        shown=shown,
+    )
+    views = [CameraView.of("cam1", camera, CameraScene(background=scene, diameter_px=50.0))]
+    step = torch.arange(12, dtype=torch.float64)
+    places = (step - 2.0)[:, None] * torch.tensor([1.0, 0.0, 0.0]).double()
+    R = so3.exp(step[:, None] * torch.tensor([0.02, 0.05, 0.06]).double())
+    rows = SphereRenderer(texture, radius_mm=10.0, camera=camera)(R, places) * 180 + behind
+    held = {"radius_mm": 10.0, "fixed": False, "seen": torch.ones(12, 1, dtype=torch.bool)}
+    place = Crops(views=views, crops=[[]], position_lab_mm=places, **held)
+    cut = [
+        cut_out(place, [row.round().byte().numpy() * shown.astype(np.uint8)], X)
+        for row, X in zip(rows, places, strict=True)
+    ]
+    found = adjusted(place.holding(cut, held["seen"], places), R, levels=LEVELS[:1])
+    assert found.left < 0.1
 
 
 def test_frames_that_were_kept_since_an_adjustment_turn_with_it(ball):

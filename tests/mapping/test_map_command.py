@@ -4,6 +4,7 @@ import json
 import shutil
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import h5py
@@ -16,12 +17,17 @@ from renders import error_deg
 
 from sphereorient import so3
 from sphereorient.cli.app import progress_bar
+from sphereorient.cli.map import _print as print_map
 from sphereorient.experiment.recording import open_recording
+from sphereorient.files.whole_file import writing
+from sphereorient.mapping import MapSettings
+from sphereorient.methods.map import learn_map
+from sphereorient.methods.settings import Settings
 from sphereorient.movies import open_movie
 from sphereorient.report.texture_map import shares_seen, write_seen, write_texture
 from sphereorient.sphere import load_texture, read_seen, seen_path
 from sphereorient.sphere.compare import compare_maps
-from sphereorient.sphere.texture import random_texture
+from sphereorient.sphere.texture import map_directions, random_texture
 from sphereorient.trajectory import Trajectory
 
 
@@ -219,3 +225,44 @@ def test_two_maps_are_compared_and_wear_is_drawn(tmp_path, monkeypatch, capsys):
     assert cv2.imread(str(tmp_path / "moved.png")).shape[1] > 500
     write_seen(torch.zeros(96, 192), tmp_path / "new.png")
     assert run(monkeypatch, capsys, *arguments)[0] == 2  # one is all unseen: nothing to compare
+
+
+def test_frames_are_named_by_the_numbers_of_the_experiment(capsys):
+    """Before: by the rows, 0 for the first frame of the part that was used."""
+    position = torch.zeros(6, 3)
+    learnt = SimpleNamespace(
+        seen=torch.ones(4, 8, dtype=torch.int64),
+        closure=SimpleNamespace(closed=0, loops=0, drift_before_rad=0.0, drift_after_rad=0.0),
+        rounds=[SimpleNamespace(moved_rad=0.0)],
+        arrived=True,
+        valid=torch.tensor([True, True, False, True, True, True]),
+        fitted=torch.ones(6, dtype=torch.bool),
+        position_lab_mm=position,
+        paint=torch.ones(6, 1),
+        jumps=torch.tensor([4]),
+    )
+    track = Trajectory.empty(np.arange(20, 26) / 100.0, cameras=("cam1",), frame_rate=100.0)
+    print_map(SimpleNamespace(learnt=learnt, track=track))
+    output = capsys.readouterr().out
+    assert "too little: frames 22\n" in output
+    assert "jumps at 1 frames: 24\n" in output
+
+
+@pytest.mark.slow
+def test_unknown_paint_of_an_old_map_spoils_nothing_of_the_new_one(copy):
+    """Before: one unknown texel in a tensor made the whole map unknown; a file's were taken for grey paint."""
+    folder = copy.parent
+    true = load_texture(folder / "texture.png")
+    old = torch.where(map_directions(len(true))[..., 2] > 0.5, torch.nan, true)
+    with writing(force=False):
+        write_texture(old, folder / "old.png")
+        write_seen(old.isfinite().long(), folder / "old.png")
+    rewrite(copy, frames=[0, 12])
+    quick = Settings(paint=MapSettings(rounds=1, pixels=400, height=64))
+    maps = [learn_map(copy, quick, init=init) for init in (old, folder / "old.png")]
+    for one in maps:
+        assert bool(one.texture[one.seen > 0].isfinite().all())
+        assert compare_maps(one.texture, true).correlation > 0.8
+        unknown = (one.seen == 0) & old.isnan()
+        assert 0.01 < float(unknown.float().mean()) < 0.5
+        assert float(one.texture[unknown].isnan().float().mean()) > 0.9

@@ -117,6 +117,13 @@ def test_other_paint_is_no_evidence_and_the_same_paint_is():
     assert odds[~same].max() < 25
 
 
+def test_photographs_that_differ_in_fine_detail_are_refused_as_such():
+    whole = pictures(near_attitudes(4, 9, 15))
+    noise = 300 * torch.randn(whole.shape, generator=torch.Generator().manual_seed(3), dtype=whole.dtype)
+    with pytest.raises(PaintError, match=r"3 that agree in fine detail, got none; .* raise paint\.detail"):
+        find_photographs(disks_of_pictures(whole), disks_of_pictures(whole + noise, 0.02, 0.15), SETTINGS)
+
+
 def test_views_compared_with_all_others_at_once_rank_rotations_as_pairs_one_by_one_do():
     R = random_attitudes(4, 10)
     disks = disks_of_pictures(pictures(R))

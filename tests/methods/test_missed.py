@@ -2,8 +2,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from sphereorient.methods.precise import comparable_cameras
 from sphereorient.methods.results import missed_text
+from sphereorient.pose.poses import no_pose, pose_table
 from sphereorient.trajectory import Reason, Trajectory
 
 FRAMES = 10
@@ -48,3 +51,15 @@ def test_where_another_camera_measures_the_map_is_not_doubted():
 )
 def test_a_camera_that_sees_the_ball_or_has_no_pictures_gets_no_remark(seen):
     assert remarks_on(ALL, seen) == []
+
+
+def test_the_own_rotation_of_a_camera_without_the_ball_is_compared_with_none():
+    whole = replace(no_pose(2, ALL[:2]), use=torch.tensor([True, True]))
+    rows = [
+        (True, True, Reason.OK, Reason.OK),
+        (True, False, Reason.OK, Reason.CONTRADICTS),
+        (True, False, Reason.OK, Reason.MISSING),
+        (False, True, Reason.NOT_FOUND, Reason.OK),
+    ]
+    frames = [replace(whole, use=torch.tensor([one, two]), reason=(why, other)) for one, two, why, other in rows]
+    assert comparable_cameras(pose_table(frames, 2)).tolist() == [[1, 1], [1, 1], [1, 0], [0, 1]]

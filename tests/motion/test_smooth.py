@@ -337,6 +337,29 @@ def test_short_segments_have_what_they_determine(frames: int, rates: bool, chang
         assert bool(x[few].isnan().all()) != changes
 
 
+def test_a_segment_of_one_frame_has_the_covariance_of_its_measurement(rng: torch.Generator) -> None:
+    truth = planted()
+    segment = torch.zeros(len(truth.time_s), dtype=torch.long)
+    segment[100:], segment[100] = -1, 1
+    result = smoothed(truth, *measured(truth, rng, factor=3.0), segment, settings=SmoothSettings())
+    assert result.position_scale > 2
+    # a track states the covariances of measurements with the factors on their sigmas
+    unit = torch.eye(3, dtype=torch.float64)
+    assert_close(result.position_cov_mm2[100] / POSITION_MM**2, result.position_scale**2 * unit)
+    assert_close(result.orientation_cov_rad2[100] / ORIENTATION_RAD**2, result.orientation_scale**2 * unit)
+    assert_close(result.cov_given_path_rad2[100], result.orientation_cov_rad2[100])
+
+
+def test_one_long_segment_among_many_short_ones_has_rates(rng: torch.Generator) -> None:
+    before = 61  # an even selection of all segments leaves out the long one
+    lengths = [3] * before + [140] + [3] * 199
+    segment = torch.cat([torch.tensor([k] * n + [-1]) for k, n in enumerate(lengths)])
+    truth = planted(time_s=clock(len(segment)))
+    result = smoothed(truth, *measured(truth, rng), segment)
+    assert result.velocity_m_s[segment == before].isfinite().all()
+    assert result.omega_lab_rad_s[segment == before].isfinite().all()
+
+
 @pytest.mark.parametrize("frames", [0, 1, 4])
 def test_too_few_frames_to_learn_from_come_back_as_they_are(frames: int, rng: torch.Generator) -> None:
     truth = planted(time_s=clock(4))

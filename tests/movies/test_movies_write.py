@@ -94,3 +94,11 @@ def test_a_full_disk_is_one_line_and_the_old_movie_stays(tmp_path, suffix):
     assert len(run.stdout.splitlines()) == 1
     assert path.read_bytes() == b"the old one"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_movie_of_a_fast_camera_has_its_rate(tmp_path):
+    path, rate_hz = tmp_path / "movie.mkv", 2998.123457
+    assert write_movie(path, pictures(), frame_rate_hz=rate_hz) == FRAMES
+    with open_movie(path) as movie:
+        assert np.array_equal(movie.sample(range(FRAMES)), pictures())
+        assert movie.played_hz == pytest.approx(rate_hz, rel=1e-4)

@@ -101,22 +101,23 @@ def test_a_recording_that_waits_loses_nothing(tmp_path, monkeypatch):
     assert recorder.summary().endswith("20 frames recorded, 0 lost")
 
 
-@pytest.mark.parametrize("after", [0, 64])
-def test_a_disk_that_is_nearly_full_ends_the_recording_whole(tmp_path, monkeypatch, after):
-    messages: list[str] = []
+@pytest.mark.parametrize(("after", "side_px"), [(0, 20), (64, 20), (4, 2048)])
+def test_a_disk_that_is_nearly_full_ends_the_recording_whole(tmp_path, monkeypatch, after, side_px):
+    """The disk is looked at each 64 frames, or each 16 MB of frames."""
+    messages, picture = [], np.full((side_px, side_px), 7, np.uint8)
     free = shutil.disk_usage(tmp_path).free
     if after and (free < 4 * LARGE or not hasattr(os, "posix_fallocate")):
         pytest.skip("needs room for a large file")
     monkeypatch.setattr("sphereorient.movies.record.LEFT_BYTES", free - LARGE if after else 1 << 62)
-    with recording(tmp_path / "run.mkv", messages.append) as recorder:
+    with recording(tmp_path / "run.mkv", messages.append, picture) as recorder:
         for k in range(after):
-            take(recorder, 0.1 * k)
+            take(recorder, 0.1 * k, picture)
         until(lambda: f": {after} frames" in recorder.summary())
         if after:
             with (tmp_path / "large").open("wb") as other:
                 os.posix_fallocate(other.fileno(), 0, 2 * LARGE)
         for k in range(after, after + 20):
-            take(recorder, 0.1 * k)
+            take(recorder, 0.1 * k, picture)
     assert f"{after} frames recorded, 20 lost" in recorder.summary()
     (only,) = messages
     assert "expected a disk with room" in only
@@ -165,7 +166,7 @@ def test_a_file_that_came_meanwhile_is_not_replaced(tmp_path):
 
 
 KILLED = """
-import os, signal, sys
+import os, signal, sys, time
 from pathlib import Path
 from types import SimpleNamespace
 import numpy as np
@@ -175,16 +176,29 @@ if __name__ == "__main__":
     recorder = Recorder(path, SimpleNamespace(frame_shape=picture.shape, dtype=picture.dtype), 0.1, print)
     for k in range(9):
         recorder.take(0.1 * k, picture, recorder.room())
-    os.kill(os.getpid(), signal.SIGKILL)
+    if sys.argv[2] == "SIGKILL":
+        os.kill(os.getpid(), signal.SIGKILL)
+    os.killpg(0, getattr(signal, sys.argv[2]))
+    time.sleep(60)
 """
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="of POSIX")
-def test_after_a_kill_of_the_tracking_the_movie_is_whole(tmp_path):
+@pytest.mark.parametrize("name", ["SIGKILL", "SIGHUP", "SIGTERM"])
+def test_after_a_kill_of_the_tracking_or_the_end_of_its_terminal_the_movie_is_whole(tmp_path, name):
+    """SIGHUP and SIGTERM reach all processes of the group. The recorder writes the movie, and ends."""
     program, path = tmp_path / "program.py", tmp_path / "run.mkv"
     program.write_text(KILLED)
     around = {**os.environ, "PYTHONPATH": str(REPO)}
-    run = subprocess.run([sys.executable, program, path], env=around, capture_output=True, check=False)
-    assert run.returncode == -signal.SIGKILL
-    until(times_path(path).exists)
+    run = subprocess.Popen([sys.executable, program, path, name], env=around, start_new_session=True)
+    assert run.wait(LIMIT_S) == -getattr(signal, name)
+
+    def ended() -> bool:
+        try:
+            os.killpg(run.pid, 0)
+        except ProcessLookupError:
+            return True
+        return False
+
+    until(ended)
     assert len(open_movie(path)) == len(load_times(times_path(path))) == 9

@@ -1,5 +1,7 @@
 """The compiled fit against torch's, which defines it: same poses, covariances and scores, everywhere."""
 
+import gc
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -22,9 +24,11 @@ from sphereorient import so3
 from sphereorient.files.compiled import built_for
 from sphereorient.pose import compiled, residuals
 from sphereorient.pose.compiled import COMPILED, IN_TORCH
+from sphereorient.pose.fit import FIRST_EVERY
 from sphereorient.pose.lights.lab import lab_light
 from sphereorient.pose.model import FIRST, LATER, SphereModel
-from sphereorient.pose.pixels import Pixels
+from sphereorient.pose.pixels import Pixels, thinned_stencil
+from sphereorient.pose.pose_fitter import PoseFitter
 from sphereorient.pose.poses import POSE_PARTS, PoseStart
 from sphereorient.sphere.texture import map_directions
 from sphereorient.sphere.texture_table import texture_table
@@ -181,3 +185,15 @@ def test_a_disk_does_not_depend_on_batch_threads_or_the_width_of_vectors(pixels,
         assert torch.equal(getattr(whole, name), getattr(threaded, name)), name
         assert torch.equal(getattr(whole, name), getattr(narrow, name)), name
         assert torch.equal(getattr(whole, name)[3:5], getattr(some, name)), name
+
+
+def test_the_record_of_a_single_pose_holds_all_that_it_points_to():
+    fitter = PoseFitter(RIG.cameras, paint_of("blobs"), radius_mm=RADIUS_MM, diameter_px=RIG.diameter_px).fitter
+    fitter = replace(fitter, widest_px=RIG.diameter_px / 2)
+    frames = [[one.numpy() for one in pictures_of(RIG, "blobs", X[:1], R[:1])[0]]]
+    fitter.settled(frames, PoseStart(X[:1], R[:1], torch.ones(1, 2, dtype=torch.bool)))
+    some = weakref.ref(thinned_stencil(fitter.stencil(fitter.optics.fine, fitter.widest_px), FIRST_EVERY))
+    thinned_stencil.cache_clear()  # as many other stencils would
+    compiled._of_stencil.cache_clear()
+    gc.collect()
+    assert some() is not None

@@ -11,11 +11,13 @@ from refine_examples import (
     BEHIND,
     BLACK,
     BLUR_PX,
+    LOOKS,
     RADIUS_MM,
     WHITE,
     Rig,
     balls,
     base_of,
+    camera_of,
     cut,
     f64,
     fitted,
@@ -31,10 +33,12 @@ from refine_examples import (
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.locate import CameraScene
 from sphereorient.pose import compiled
 from sphereorient.pose import residuals as residuals_module
-from sphereorient.pose.camera_view import Optics, PyramidLevel
+from sphereorient.pose.camera_view import CameraView, Optics, PyramidLevel
 from sphereorient.pose.fit import longest_near_rad
+from sphereorient.pose.fitter import first_fitter
 from sphereorient.pose.model import FIRST
 from sphereorient.pose.pixels import Pixels, cut_pixels, stacked
 from sphereorient.pose.poses import POSE_PARTS, FittedPoses
@@ -620,3 +624,16 @@ def test_a_step_is_long_by_the_blurs_angle_and_sooner_where_edges_fall_between_p
     assert longest_near_rad(0.62, 30.0) == longest_near_rad(0.9, 40.0)  # wide enough: the largest
     assert 400 * longest_near_rad(0.62, 400.0) == pytest.approx(200 * longest_near_rad(0.62, 200.0))
     assert longest_near_rad(0.45, 70.0) < 0.5 * longest_near_rad(0.55, 70.0)
+
+
+def test_the_largest_picture_of_all_cameras_bounds_the_disk_whatever_their_order():
+    large, small = camera_of("pinhole", LOOKS[0], 400.0, 1000), camera_of("pinhole", LOOKS[1], 64.0, 160)
+    views = [
+        CameraView.of(
+            "cam", camera, CameraScene(background=scene_of(np.zeros(camera.image_size, np.float32)), diameter_px=64.0)
+        )
+        for camera in (large, small)
+    ]
+    one, other = (first_fitter(each, RADIUS_MM, base_of("blobs"), BLUR_PX) for each in (views, views[::-1]))
+    reach = [fitter.stencil(fitter.optics.fine, 200.0).reach for fitter in (one, other)]
+    assert reach[0] == reach[1] > 200

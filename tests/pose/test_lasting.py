@@ -25,6 +25,7 @@ from refine_examples import (
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.calibration.systematic import with_lasting_errors
 from sphereorient.follow.appearance.light import light_and_blur
 from sphereorient.follow.appearance.record import Studied
 from sphereorient.pose.compiled import fitted_residuals
@@ -33,6 +34,7 @@ from sphereorient.pose.lights.disk import glint_shares
 from sphereorient.pose.model import SphereModel
 from sphereorient.pose.pixels import Pixels
 from sphereorient.pose.poses import FittedPoses, PoseStart
+from sphereorient.trajectory import Reason, Trajectory
 
 COUNT, SIGMA = 24, 4.0
 LOBE, LOBE_AT, LOBE_WIDTH = 60.0, (0.45, -0.3), 0.2  # grey levels; radii along the camera's x and y
@@ -220,3 +222,22 @@ def test_light_by_the_logarithm_of_its_power_is_that_of_differences():
     light, scale, step = torch.tensor([3.0, 40.0, 90.0], dtype=torch.float64), torch.tensor(40.0), 1e-5
     more, less = (scale * (light / scale) ** np.exp(power) for power in (step, -step))
     assert_close(by_power(light, scale), (more - less) / (2 * step), atol=1e-6)
+
+
+def test_the_errors_of_some_cameras_are_those_that_a_track_states():
+    """Four cameras with independent errors; in frame k all but the first k + 1 do not see the ball."""
+    one = torch.diag(torch.arange(1.0, 7.0, dtype=torch.float64)) * 1e-4
+    found = Lasting(covariance=one / 4, own_rad2=one[:3, :3].expand(4, 3, 3), alone=one.expand(4, 6, 6))
+    track = Trajectory.empty(np.arange(4.0), cameras=[f"cam{k}" for k in range(4)])
+    cameras = {
+        name: replace(camera, reason=tuple(Reason.OK if k <= frame else Reason.HIDDEN for frame in range(4)))
+        for k, (name, camera) in enumerate(track.cameras.items())
+    }
+    zero = np.zeros((4, 3, 3))
+    track = replace(track, orientation_cov=zero, position_cov=zero, cameras=cameras)
+    track = with_lasting_errors(track, found.covariance, found.alone)
+    for frame in range(4):
+        stated = found.of_use(torch.arange(4) <= frame)
+        torch.testing.assert_close(stated[:3, :3], torch.from_numpy(track.orientation_cov[frame]), rtol=1e-6, atol=0.0)
+        torch.testing.assert_close(stated[3:, 3:], torch.from_numpy(track.position_cov[frame]), rtol=1e-6, atol=0.0)
+        torch.testing.assert_close(stated, one / (frame + 1), rtol=1e-6, atol=0.0)

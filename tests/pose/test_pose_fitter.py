@@ -8,7 +8,7 @@ from conftest import assert_close
 from refine_examples import BEHIND, BLUR_PX, RADIUS_MM, balls, noisy, paint_of, pictures_of, rig_of, turned
 
 from sphereorient import so3
-from sphereorient.errors import ShapeError
+from sphereorient.errors import CameraError, SettingsError, ShapeError
 from sphereorient.pose import camera_view
 from sphereorient.pose.pose_fitter import PoseFitter
 from sphereorient.sphere.texture import map_directions
@@ -104,6 +104,33 @@ def test_pictures_of_another_size_are_refused(seen):
     fitter, X, R, pictures = seen
     with pytest.raises(ShapeError, match=r"got \(4, 2, 160, 159\)"):
         fitter(pictures[..., 1:], R, X)
+
+
+def test_inputs_that_do_not_agree_are_refused(seen):
+    fitter, _, R, pictures = seen
+    with pytest.raises(ShapeError, match=r"position_lab_mm: expected shape \(4, 3\) or \(3,\), got \(5, 3\)"):
+        fitter(pictures, R, torch.zeros(5, 3))
+    given = {"radius_mm": RADIUS_MM, "diameter_px": 64.0}
+    paint, (width, height) = paint_of("patches"), RIG.cameras[0].image_size
+    with pytest.raises(CameraError, match="one or more, got none"):
+        PoseFitter([], paint, **given)
+    with pytest.raises(CameraError, match="one picture size, got 160 x 160 px, 175 x 175 px"):
+        PoseFitter([RIG.cameras[0], rig_of(70.0).cameras[1]], paint, **given)
+    with pytest.raises(SettingsError, match="blur_px: expected a number above 0, got 0"):
+        PoseFitter(RIG.cameras, paint, blur_px=0.0, **given)
+    with pytest.raises(ShapeError, match=r"background: expected shape \(2, 160, 160\), got \(160, 160\)"):
+        PoseFitter(RIG.cameras, paint, background=torch.zeros(height, width), **given)
+
+
+def test_the_only_cameras_background_needs_no_axis_of_cameras(seen):
+    _, X, R, pictures = seen
+    given = {"radius_mm": RADIUS_MM, "diameter_px": 64.0, "blur_px": BLUR_PX}
+    scene = torch.full(pictures.shape[-2:], BEHIND)
+    one, other = (
+        PoseFitter(RIG.cameras[0], paint_of("patches"), background=background, **given)(pictures[:, 0], R, X)
+        for background in (scene, scene[None])
+    )
+    assert torch.equal(one.R_lab_body, other.R_lab_body)
 
 
 TABLES = [(80, 0.4, 512), (100, 0.4, 512), (160, 0.4, 1024), (400, 0.8, 1024)]

@@ -1,6 +1,7 @@
 """The measures of the check against oracles: outlines, blur, gaps, the value of start:."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,9 +22,9 @@ from sphereorient.locate import Background, sightings_of
 from sphereorient.locate.outline import Outline
 from sphereorient.preflight import Severity
 from sphereorient.preflight.cameras import expected_outline_px
-from sphereorient.preflight.finding import FAULT, OK
-from sphereorient.preflight.in_step import OffsetScan, in_step, scan_offsets, starts_in_step
-from sphereorient.preflight.movies import limb_blur_px, motion_blur
+from sphereorient.preflight.finding import FAULT, OK, Finding
+from sphereorient.preflight.in_step import OffsetScan, in_step, liveliest_stretches, scan_offsets, starts_in_step
+from sphereorient.preflight.movies import exposure, limb_blur_px, motion_blur
 from sphereorient.preflight.sample import frames_to_sample, pair_starts
 from sphereorient.preflight.texture_map import match_texture
 from sphereorient.trajectory import Reason
@@ -255,3 +256,55 @@ def test_the_one_of_three_movies_out_of_step_is_named(late, start):
 
 def test_three_movies_in_step_get_no_finding():
     assert in_step(scans_of({"cam1": 0.0, "cam2": 0.03, "cam3": -0.02}), {}).severity is OK
+
+
+def test_a_movie_whose_lag_is_unknown_is_named_and_begins_with_the_first_one():
+    """Before: the advised start: left it where it was, late on the others by as much as they moved."""
+    still = scans_of({"cam1": 0.0, "cam3": math.nan})[0]
+    scans = [*scans_of({"cam1": 0.0, "cam2": -2.0}), replace(still, moved_px=0.1)]
+    found = in_step(scans, {})
+    assert found.severity is FAULT
+    assert "cam3: unknown" in found.measured
+    assert found.advice == "set start: {cam1: 2, cam2: 0, cam3: 2}"
+    assert in_step([*scans_of({"cam1": 0.0, "cam2": 0.02}), scans[1]], {}).severity is OK
+
+
+def test_stretches_lie_where_the_ball_moves_most_in_one_frame():
+    """Before: pairs of consecutive frames of a usual sample, also of one that was sampled more closely without them."""
+    count = 1000
+    frame = np.array(frames_to_sample(count, 100))
+    burst = int(frame[:-1][(np.diff(frame) == 1)][20])
+    x_mm = 0.02 * np.arange(count) + 6.0 * (np.arange(count) > burst)
+    path = torch.stack([f64(x_mm - 13.0), torch.zeros(count).double(), torch.zeros(count).double()], dim=-1)
+    samples = [
+        SimpleNamespace(
+            stream=range(count),
+            frame=frame,
+            camera=camera,
+            sightings=SimpleNamespace(centre_px=camera.project(path)[frame]),
+        )
+        for camera in (ALONG_Y, DOWN_Z)
+    ]
+    first = liveliest_stretches(samples)[0]
+    assert {burst, burst + 1} <= set(first)
+
+
+def test_masked_pixels_are_no_paint():
+    """Before: a lit post before the ball was saturated paint."""
+    outline = Outline(u_px=50.0, v_px=50.0, radius_px=30.0, rms_px=0.1, coverage=1.0)
+    picture = np.random.default_rng(0).integers(20, 200, (100, 100)).astype(np.uint8)
+    picture[:, 45:55] = 255
+    background = Background(
+        mean=np.full((100, 100), 20, np.float32), noise=np.full((100, 100), 1.5, np.float32), full_scale=255.0
+    )
+
+    def judged_by(shown: np.ndarray | None) -> Finding:
+        stream = SimpleNamespace(shown=shown)
+        return exposure(SimpleNamespace(name="cam1", balls=[(picture, outline)], background=background, stream=stream))
+
+    mask = np.ones((100, 100), bool)
+    mask[:, 45:55] = False
+    assert judged_by(None).severity is FAULT
+    assert judged_by(mask).severity is OK
+    assert "0.0 % of the ball saturated" in judged_by(mask).measured
+    assert "unknown" in judged_by(np.zeros((100, 100), bool)).measured

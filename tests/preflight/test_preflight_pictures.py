@@ -15,7 +15,7 @@ from preflight_examples import PAINTED, Example, checked, clean_example, complai
 
 from sphereorient.errors import MovieError
 from sphereorient.experiment.recording import open_recording
-from sphereorient.locate import LocateSettings
+from sphereorient.locate import LocateSettings, find_scenes
 from sphereorient.methods.settings import load_settings
 from sphereorient.preflight import Severity, preflight
 from sphereorient.preflight.sample import sample_movie
@@ -166,6 +166,32 @@ def test_a_fixed_ball_that_is_not_found_is_searched_where_the_mask_shows_it(clea
         stream = recording.streams[0]
         sample = sample_movie(stream, None, LocateSettings(), stays=True)
         np.testing.assert_array_equal(sample.background.shown, stream.shown)
+
+
+@pytest.mark.parametrize("circles", [None, {"cam1": [120.0, 120.0, 28.0]}], ids=["found", "given"])
+def test_the_full_scale_of_a_fixed_ball_is_that_of_its_camera(clean, tmp_path, circles):
+    """Before: 65535 for cameras of 12 bits: saturated pixels were none, and light was that of a dark picture."""
+    ball = clean.pictures["cam1"][0].astype(np.uint16)
+    light = np.random.default_rng(0).uniform(14.0, 30.0, (12, 1, 1)) * np.where(ball > 60, 1.0, 0.6)
+    deep = np.minimum(ball * light, 4095).astype(np.uint16)
+    one = replace(clean, pictures={"cam1": deep})
+    keys = {"sphere": {"diameter": 18.0, "fixed": True}, "backgrounds": None, "circles": circles}
+    with open_recording(write(one, tmp_path, **keys), textured=False) as recording:
+        (scene,) = find_scenes(recording, recording.streams[0], 12, LocateSettings()).values()
+    assert scene.background.full_scale == 4095
+
+
+@pytest.mark.slow
+def test_a_ball_that_one_camera_does_not_show_is_reported_of_this_camera(clean, tmp_path):
+    """Before: a traceback, as more frames of this camera were read than of the other one."""
+
+    def empty(movie: np.ndarray) -> np.ndarray:
+        return scene_alone(clean, "cam2", len(movie))
+
+    result = checked(clean.spoilt(empty, ("cam2",)), tmp_path)
+    assert of(result, "ball cam1").severity is OK
+    assert of(result, "ball cam2").severity is FAULT
+    assert len(result.samples[0].frame) == len(result.samples[1].frame)
 
 
 @pytest.mark.slow

@@ -1,18 +1,22 @@
 """The check of several balls: too many or too few named, balls that are not found, sizes, and exchanged names."""
 
+import shutil
 from types import SimpleNamespace
 
 import pytest
 import torch
+import yaml
 
 from sphereorient import so3
 from sphereorient.experiment import Sphere
 from sphereorient.files.threads import silent
 from sphereorient.locate.outline import Outline
+from sphereorient.preflight import preflight
 from sphereorient.preflight.finding import FAULT, OK, WARNING
 from sphereorient.preflight.scene import ball_sizes, disk_counts, found_balls, look_at_scene, same_paint
 from sphereorient.sphere.compare import turned_map
 from sphereorient.sphere.texture import random_texture
+from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
 PX_PER_MM = 4.0
 
@@ -112,3 +116,20 @@ def test_two_maps_of_one_paint_are_reported():
     turned = turned_map(a, so3.exp(torch.tensor([[0.4, -1.1, 0.7]], dtype=torch.float64))[0])
     (finding,) = same_paint({"a.png": a, "b.png": b, "c.png": turned}, silent)
     assert (finding.title, finding.severity) == ("paint of a.png and c.png", WARNING)
+
+
+@pytest.mark.slow  # two balls are searched
+def test_maps_of_one_name_in_two_folders_are_told_apart(tmp_path):
+    """Before: the last one stood for both; nothing was said of the other one, nor that the paint is the same."""
+    settings = SynthSettings(
+        frames=24, balls=2, paints=1, image_size=(220, 200), diameter_mm=12.0, diameter_px=40.0, volume_mm=30.0, seed=2
+    )
+    path = write_synthetic_experiment(tmp_path / "two", settings)
+    document = yaml.safe_load(path.read_text())
+    for name, ball in document["spheres"].items():
+        (path.parent / name).mkdir()
+        shutil.copy(path.parent / ball["texture"], path.parent / name / "texture.png")
+        ball["texture"] = f"{name}/texture.png"
+    path.write_text(yaml.safe_dump(document))
+    titles = [one.title for one in preflight(path).findings]
+    assert {"paint a/texture.png", "paint b/texture.png", "paint of a/texture.png and b/texture.png"} <= set(titles)

@@ -4,14 +4,18 @@ import math
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import yaml
 from mark_examples import opened, place, served
+from preflight_examples import CAMERAS, clean_example, write  # noqa: F401
 
+from sphereorient.cameras.response import Response
 from sphereorient.errors import SphereOrientError
 from sphereorient.experiment import load_experiment
 from sphereorient.experiment.recording import given_mask
+from sphereorient.preflight.clip import Clip, in_light
 from sphereorient.preflight.mark_masks import MaskMarking
 from sphereorient.synth import SynthSettings, write_synthetic_experiment
 
@@ -86,6 +90,39 @@ def test_tried_values_are_saved_and_all_else_stays(marking):
     assert tried["circles"] == {"cam1": (75.25, 74.5, 28.0)}, "the saved one from now on"
 
 
+def test_only_the_circle_of_this_camera_is_written(clean, tmp_path):
+    """Before: all circles, as they were when the page was opened; those edited meanwhile were lost."""
+    circles = {"cam1": [120.0, 120.0, 28.0], "cam2": [120.0, 120.0, 28.0]}
+    path = write(clean, tmp_path, sphere={"diameter": 18.0, "fixed": True}, circles=circles)
+    marking = MaskMarking(path)
+    document = yaml.safe_load(path.read_text())
+    lines = yaml.safe_dump({key: value for key, value in document.items() if key != "circles"})
+    path.write_text(lines + "circles: {cam1: [120.0, 120.0, 28.0], cam2: [110.0, 119.0, 27.0]}\n")
+    marking.done(["adopt", "cam1"], NOTHING | {"circle": [118.0, 121.0, 28.5]})
+    assert load_experiment(path).circles == {"cam1": (118.0, 121.0, 28.5), "cam2": (110.0, 119.0, 27.0)}
+
+
+def test_frames_without_a_picture_of_each_camera_are_left_out_of_all(clean, tmp_path):
+    """Before: of this camera only, so that its later pictures were compared with those of other frames."""
+    path = write(clean, tmp_path, sphere={"diameter": 18.0, "fixed": True}, movies={name: name for name in CAMERAS})
+    for name in CAMERAS:
+        (tmp_path / name).mkdir()
+        for k in range(12):
+            if (name, k) != ("cam2", 5):
+                cv2.imwrite(str(tmp_path / name / f"{k:03d}.png"), np.full((240, 240), 10 * k, np.uint8))
+    pictures = Clip(load_experiment(path)).pictures
+    grey = {name: [int(one[0, 0]) for one in each] for name, each in pictures.items()}
+    assert grey == {name: [10 * k for k in range(12) if k != 5] for name in CAMERAS}
+
+
+def test_light_of_12_bits_is_that_of_8_bits():
+    """Before: light relative to 65535, where a camera of 12 bits is black by any response."""
+    levels = np.linspace(0, 255, 256).astype(np.uint8).reshape(16, 16)
+    response = Response(srgb=True)
+    (shallow,), (deep,) = (in_light([one], response) for one in (levels, levels.astype(np.uint16) * 16 + 15))
+    assert np.abs(deep.astype(float) - shallow).max() < 0.01 * 65535
+
+
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
@@ -136,6 +173,28 @@ def test_a_person_tries_another_circle_and_saves_it(marking, browser):
         page.get_by_role("button", name="save these").click()
         page.get_by_text("Wrote").wait_for()
     assert load_experiment(marking.path).circles["cam1"][2] == pytest.approx(found - 3)
+
+
+@pytest.mark.slow  # a browser
+def test_a_field_of_view_that_nobody_edited_is_not_written(marking, browser):
+    """Before: the two digits that the page shows replaced the calibrated value."""
+    cameras = marking.path.with_name("one.yaml")
+    cameras.write_text(cameras.read_text().replace(f"vfov_deg: {VFOV_DEG}", "vfov_deg: 20.012345"))
+    before = cameras.read_text()
+    marking = MaskMarking(marking.path)
+    with served(marking) as address, opened(browser, f"{address}/{marking.token}/") as page:
+        for label, value in (("u", "75"), ("v", "75"), ("radius", "28")):
+            page.locator(f"#{label}").fill(value)
+        page.get_by_role("button", name="save these").click()
+        page.get_by_text("Wrote").wait_for()
+        assert load_experiment(marking.path).circles["cam1"] == (75, 75, 28)
+        assert cameras.read_text() == before
+        for value in ("25", "20.01"):  # then, the digits that it showed first
+            page.locator("#vfov").fill(value)
+            with page.expect_response("**/adopt/*"):
+                page.get_by_role("button", name="save these").click()
+            page.get_by_text("one.yaml").wait_for()
+            assert f"vfov_deg: {float(value)}  # measured" in cameras.read_text()
 
 
 @pytest.mark.slow  # a browser

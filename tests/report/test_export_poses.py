@@ -102,6 +102,13 @@ def test_fictracs_columns_belong_together(track, axes, tmp_path):
     np.testing.assert_allclose(table[:, 21], 1e3 * track.time)
 
 
+def test_fictracs_frame_is_that_of_the_experiment(axes):
+    """Before: the row, so that a part of the frames, or a track without some, was compared with other ones."""
+    part = true_track().at(np.array([5, 6, 8, 12, 13]))
+    table = fictrac_table(part, axes)
+    np.testing.assert_array_equal(table[:, 0], [5, 6, 8, 12, 13])
+
+
 def test_fictracs_table_needs_the_camera(track, tmp_path):
     with pytest.raises(OutputError, match="add --experiment"):
         export_track(track, tmp_path / "t.dat")

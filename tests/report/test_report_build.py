@@ -199,12 +199,18 @@ def test_names_of_tracks_are_as_short_as_they_can_be(place):
     assert replace(names["precise.h5"]).method == "precise"
 
 
-@pytest.mark.parametrize("name", ["notes.txt", "tables/mine.txt", "figures/a.txt"])
+@pytest.mark.parametrize(
+    "name", ["notes.txt", "tables/mine.txt", "figures/a.txt", "tables/mine.csv", "figures/own.png", "figures/own.pdf"]
+)
 def test_a_file_of_the_users_in_a_report_stays(tmp_path, name):
-    """Before: only the names in the folder itself were looked at; tables/ and figures/ went with all in them."""
+    """Before: only the names in the folder itself were looked at, then those with other endings than a report's."""
     out = tmp_path / "report"
     (out / name).parent.mkdir(parents=True)
-    (out / "index.html").write_text('<!doctype html>\n<meta name="generator" content="made by sphereorient">')
+    page = '<!doctype html>\n<meta name="generator" content="made by sphereorient">\n'
+    (out / "index.html").write_text(page + '<a href="tables/moments.csv">csv</a> figures/track.png, .pdf')
+    for made in ("tables/moments.csv", "figures/track.png", "figures/track.pdf"):
+        (out / made).parent.mkdir(exist_ok=True)
+        (out / made).write_text("of the report")
     check_report_folder(out)
     (out / name).write_text("mine")
     with pytest.raises(OutputError, match="got other files in it"):

@@ -18,6 +18,8 @@ from sphereorient.report import plots
 from sphereorient.report.build import write_report
 from sphereorient.report.columns import columns, to_xarray
 from sphereorient.report.export import export_track
+from sphereorient.report.page import page_html
+from sphereorient.report.tables import tables_of
 from sphereorient.report.verdicts import verdicts
 from sphereorient.statistics import StatisticsSettings, summarise
 from sphereorient.statistics.noise import width_curve
@@ -84,6 +86,23 @@ def test_statistics_and_their_figures_have_lengths_in_radii():
     ]
     widths = {"acceleration": width_curve([tracks], "acceleration", settings=FEW)}
     assert "(radii/s²)" in plots.widths_figure(widths).axes[0].get_ylabel()
+
+
+def test_tables_and_page_of_a_report_have_lengths_in_radii():
+    """Before: errors in mm and velocities in m/s, of numbers in radii."""
+    one = replace(draw_ensemble(EnsembleSpec(segments=6, mean_frames=90.0), 1), length_unit="radii")
+    tracks, summary = {"a.h5": one, "b.h5": one}, summarise([one], FEW)
+    tables = tables_of(summary, tracks, [])
+    (row, _), (other, _) = (
+        {table.name: table for table in made}["tracks"].rows
+        for made in (tables, tables_of(summary, dict.fromkeys(tracks, replace(one, length_unit="mm")), []))
+    )
+    assert not lengths_in(" ".join(row))
+    assert row["rms_v_radii_s"] == other["rms_v_m_s"]
+    page = page_html(summary, tracks, "", verdicts=[], tables=tables, suffixes=["csv"], figures=[], strips=[])
+    heads = re.findall("<th[^>]*>([^<]*)</th>", page)
+    assert {"stated error, radii", "rms of v, radii/s"} <= set(heads)
+    assert not lengths_in(" ".join(heads))
 
 
 def test_velocities_are_lengths_of_the_position_a_second():

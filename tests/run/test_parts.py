@@ -1,5 +1,7 @@
 import json
 import multiprocessing
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -8,13 +10,17 @@ import pytest
 import torch
 from excerpt_examples import EXCERPT
 
+from sphereorient.cameras.parameters import with_parameters
+from sphereorient.cameras.response import Response
 from sphereorient.errors import OutputError, TrackError
+from sphereorient.experiment import load_experiment, open_movies
 from sphereorient.files.hdf5 import digest
 from sphereorient.follow.follower import Batch
 from sphereorient.methods.method import read_poses
 from sphereorient.methods.settings import load_settings
 from sphereorient.pose.poses import Poses, blank_parts
 from sphereorient.run import FolderStore, Request
+from sphereorient.run.store import fingerprint
 from sphereorient.trajectory import Reason
 
 BATCH = Batch(first=0, last=3, lengths=(3,))
@@ -157,3 +163,42 @@ def test_another_process_cannot_write_the_same_track(tmp_path):
         other.join(60)
     assert other.exitcode == 0
     assert not request.parts.exists()
+
+
+CHANGES = {
+    "frames": lambda old: replace(old, frames=(8, 16)),
+    "rate": lambda old: replace(old, frame_rate_hz=599.0),
+    "start": lambda old: replace(old, start={"cam1": 1, "cam2": 0}),
+    "response": lambda old: replace(old, response={"cam1": Response(gamma=2.2)}),
+    "diameter": lambda old: old.with_sphere(diameter_mm=18.0001),
+    "camera": lambda old: replace(
+        old, cameras=old.cameras | {"cam1": with_parameters(old.cameras["cam1"], ["T_x"], torch.tensor([1e-5]))}
+    ),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_an_experiment_changed_in_python_is_another_run(tmp_path, change):
+    """Before: the text of its file counted alone; poses of other frames went into the track."""
+    old = load_experiment(EXCERPT / "experiment.yaml")
+    kept, same, other = (
+        fingerprint(replace(request_to(tmp_path / "track.h5"), experiment=one))
+        for one in (EXCERPT / "experiment.yaml", old, change(old))
+    )
+    assert same == kept
+    assert other != kept
+
+
+def test_the_same_experiment_by_another_path_is_the_same_run(tmp_path, monkeypatch):
+    shutil.copytree(EXCERPT, tmp_path / "copy")
+    path = tmp_path / "copy" / "experiment.yaml"
+    count = len(open_movies(load_experiment(path))["cam1"])
+    (tmp_path / "copy" / "times.csv").write_text("\n".join(f"{k / 600}" for k in range(count)))
+    path.write_text(path.read_text().replace("frame_rate: 600.0", "times: times.csv"))
+    assert load_experiment(path).times is not None
+    monkeypatch.chdir(tmp_path)
+    one, other = (
+        fingerprint(replace(request_to(tmp_path / "track.h5"), experiment=given))
+        for given in (path, Path("copy/experiment.yaml"))
+    )
+    assert one == other

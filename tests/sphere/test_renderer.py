@@ -141,6 +141,14 @@ def test_a_sphere_beyond_the_edge_is_cut_off_there(texture):
         assert_close(here, there[100:148, 100:148], atol=1e-9)
 
 
+def test_a_map_with_unknown_paint_is_trained_too(texture, R):
+    spoilt = torch.nn.Parameter(texture.clone().index_fill_(0, torch.arange(20), torch.nan))
+    renderer = SphereRenderer(spoilt, size_px=12)
+    assert [name for name, _ in renderer.named_parameters()] == ["texture"]
+    renderer(R).sum().backward()
+    assert bool(renderer.texture.grad.isfinite().all())
+
+
 def test_impossible_scenes_are_refused(texture, R):
     with pytest.raises(SettingsError, match="got neither"):
         SphereRenderer(texture)
@@ -154,6 +162,8 @@ def test_impossible_scenes_are_refused(texture, R):
         SphereRenderer(texture, size_px=8)(R[..., :2])
     with pytest.raises(ShapeError, match="position_mm"):
         SphereRenderer(texture, size_px=8)(R, torch.zeros(2))
+    with pytest.raises(ShapeError, match=r"leading shapes that agree .* got \(3,\), \(5,\), \(\)"):
+        SphereRenderer(texture, size_px=8)(R, torch.zeros(5, 3))
     with pytest.raises(CameraError, match="visible ball"):
         SphereRenderer(texture, radius_mm=9.0, camera=near_camera())(R, f64([0, -260.0, 0]))
 

@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 import torch
 from conftest import assert_close
+from PIL import Image
 from sphere_examples import body_direction, f64, looked_up, random_map
 
 from sphereorient.errors import ShapeError, TextureError
-from sphereorient.sphere import load_texture, load_unseen, reduced_texture, sample_texture, unseen_share
+from sphereorient.sphere import load_known, load_texture, load_unseen, reduced_texture, sample_texture, unseen_share
 from sphereorient.sphere.texture import map_directions, sample_spline, texel_areas, texture_coordinates
 
 
@@ -282,3 +283,25 @@ def test_texel_areas_are_those_of_their_zones():
     area = texel_areas(3) / (4 * math.pi)  # 60 degrees a row
     assert float(area.sum()) == pytest.approx(1.0)
     assert_close(area[:, 0] * 6, torch.tensor([0.25, 0.5, 0.25], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("mode", ["indexed", "grey"])
+def test_a_transparent_index_or_grey_level_is_no_paint(tmp_path, mode):
+    grey, path = pattern().clip(1), tmp_path / "clear.png"
+    grey[:4] = 0
+    picture = Image.fromarray(grey)
+    if mode == "indexed":
+        picture.putpalette([level for level in range(256) for _ in range(3)])
+    picture.save(path, transparency=0)
+    assert torch.equal(load_unseen(path), torch.arange(16)[:, None].expand(-1, 32) < 4)
+
+
+def test_a_map_is_read_with_its_unseen_texels_as_nan(tmp_path):
+    path = saved(tmp_path, pattern())
+    assert torch.equal(load_known(path), load_texture(path))
+    counts = np.full((16, 32), 7, np.uint8)
+    counts[:4] = 0
+    saved(tmp_path, counts, "texture_seen.png")
+    known = load_known(path)
+    assert bool(known[:4].isnan().all())
+    assert torch.equal(known[4:], load_texture(path)[4:])

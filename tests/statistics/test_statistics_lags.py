@@ -102,6 +102,16 @@ def test_lags_that_no_segment_reaches_are_left_out():
     assert found.lag_frames.tolist() == [5, 19]
 
 
+def test_a_segment_of_isolated_frames_has_no_increments_and_hides_no_other_ones():
+    """Before: no lag had pairs in both segments, and the command ended in a traceback."""
+    whole = ensemble([300, 60])
+    alone = without(whole, np.flatnonzero((whole.segment == 0) | np.isin(whole.frame, [10, 30])))
+    found = increments(alone, settings=FEW)
+    assert found.lag_frames[0] == 1
+    assert found.pairs[0] == 299
+    assert np.isfinite(found.rms.value).all()
+
+
 def test_an_integral_ends_before_lags_that_no_pair_reaches():
     curve = np.array([[1.0], [0.8], [0.6], [np.nan], [0.9]])
     assert integral_time(curve, np.arange(5.0)) == pytest.approx(0.9 + 0.7)

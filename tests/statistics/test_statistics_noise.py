@@ -89,3 +89,35 @@ def test_a_lost_frame_is_not_differentiated_over(track):
     position[::20] = np.nan
     found = width_curve([replace(track, position=position)], "acceleration", (1.0, 2.0), FEW)
     assert np.isfinite(found.rms.value).all()
+
+
+def test_widths_of_tracks_of_two_rates_are_times(true, track):
+    """Before: frames of each track's own rate, averaged as if they were of the first one."""
+    part = true.at(np.flatnonzero(true.segment < 40))
+    every = np.arange(len(part)) % 2 == 0
+    slow = replace(part.at(np.flatnonzero(every)), frame_rate=part.frame_rate / 2)
+    widths = (2.0, 4.0)
+    of_slow = width_curve([slow], "acceleration", widths, FEW)
+    of_fast = width_curve([part], "acceleration", [2 * width for width in widths], FEW)
+    np.testing.assert_allclose(of_fast.rms.value, of_slow.rms.value, rtol=0.05)  # one motion, one width in s
+    for both in ([slow, part], [part, slow]):
+        found = width_curve(both, "acceleration", widths, FEW)
+        np.testing.assert_allclose(found.width_s, of_slow.width_s)
+        np.testing.assert_allclose(found.rms.value, of_slow.rms.value, rtol=0.05)
+
+
+def test_tracks_of_two_rates_have_no_lags_in_common(track):
+    slow = replace(track, time=2 * track.time, frame_rate=track.frame_rate / 2)
+    with pytest.raises(TrackError, match="tracks of one frame rate") as caught:
+        multi_lag([track, slow], "acceleration", settings=FEW)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_track_of_one_frame_has_no_width_and_disturbs_no_other(track):
+    alone = width_curve([track], "acceleration", (2.0,), FEW)
+    for segment in (0, -1):
+        one = replace(track.at(np.array([0])), segment=np.array([segment]))
+        for both in ([one, track], [track, one]):
+            found = width_curve(both, "acceleration", (2.0,), FEW)
+            np.testing.assert_array_equal(found.rms.value, alone.rms.value)
+            np.testing.assert_array_equal(found.width_s, alone.width_s)

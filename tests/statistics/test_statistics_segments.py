@@ -110,6 +110,12 @@ def test_long_segments_are_cut_into_equal_pieces():
     assert (found.span_s <= 201 * STEP_S).all()
 
 
+def test_frames_without_a_motion_cannot_be_cut():
+    """Before: an IndexError."""
+    still = replace(track([60]), velocity=np.full((62, 3), np.nan))
+    assert len(ensemble_of(still, SegmentSettings(max_duration_s=20 * STEP_S), fewest=0)) == 0
+
+
 def test_an_ensemble_of_one_segment_only_by_its_option():
     with pytest.raises(TrackError, match=r"two segments.*got 1.*max_duration_s"):
         ensemble_of(track([60]))

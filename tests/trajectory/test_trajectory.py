@@ -13,6 +13,7 @@ import pytest
 
 from sphereorient.errors import OutputError, ShapeError, TrackError
 from sphereorient.trajectory import CameraTrack, Flag, Reason, Trajectory
+from sphereorient.trajectory.datasets import nearest_rows
 
 FRAMES = 7
 # docs/data-format.md, written out once more so that the code's own table is not its own oracle
@@ -296,3 +297,11 @@ def test_the_plot_has_a_row_of_axes_for_each_quantity_with_its_unit(tmp_path: Pa
     assert np.isnan(w[3])
     np.testing.assert_array_equal(figure.axes[0].lines[0].get_ydata(), track.position[:, 0])
     assert len(Trajectory.empty(np.zeros(0)).plot().axes) == 4
+
+
+@pytest.mark.parametrize(("known", "wanted"), [(2, 1), (1, 2)])
+def test_rows_match_to_half_of_the_shorter_step(known: int, wanted: int) -> None:
+    """Before: to half of the known one, so that a frame between two known ones was compared with either."""
+    row, there = nearest_rows(np.arange(0, 20, known), np.arange(0, 20, wanted) + 0.3)
+    assert there.tolist() == [k % known == 0 for k in range(0, 20, wanted)]
+    np.testing.assert_array_equal((known * row)[there], np.arange(0, 20, wanted)[there])

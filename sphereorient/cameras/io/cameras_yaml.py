@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 
 from sphereorient.cameras.brown import BrownCamera, OpenPTVCamera, TsaiCamera
 from sphereorient.cameras.camera import Camera, ParameterCovariance
-from sphereorient.cameras.checks import camera_error, check_known, named
+from sphereorient.cameras.checks import camera_error, check_camera_names, check_known, named
 from sphereorient.cameras.fisheye import FisheyeCamera
 from sphereorient.cameras.model import CameraModel, Key, PinholeCamera, TelecentricCamera
 from sphereorient.cameras.parameters import parameter_names
@@ -105,25 +105,27 @@ def load_cameras(path: Path | str) -> dict[str, Camera]:
     if len(entries) > MOST:
         do = "write those of one experiment"
         raise camera_error(f"{path}, cameras", f"at most {MOST} cameras", f"{len(entries)}", do)
+    check_camera_names(map(str, entries), f"{path}, cameras")
     alone = len(entries) == 1
     return {str(name): _build(entry, f"{path}, {name}", alone) for name, entry in entries.items()}
 
 
 def load_covariance(path: Path | str, cameras: Mapping[str, Camera]) -> ParameterCovariance | None:
     """Read the joint covariance of the given cameras from cameras.yaml, with parameters named camera.parameter.
-    Without a joint one: the cameras' own as independent blocks; None if one is missing. CameraError if impossible.
+    Cameras that it does not name add their own as independent blocks; None if one of these has none. CameraError if
+    impossible.
     """
     path = Path(path)
     entry = read_document(path, SCHEMA, CameraError).get("covariance")
     if entry is None:
-        return _independent(cameras)
+        return _with_own(None, cameras)
     where = f"{path}, covariance"
     checked = validated(CovarianceEntry, entry, where, CameraError)
     with named(str(path)):
         own = checked.covariance().of(cameras)
     known = [f"{name}.{parameter}" for name, camera in cameras.items() for parameter in parameter_names(camera)]
     check_known(() if own is None else own.names, known, f"{where}, parameters")
-    return own
+    return _with_own(own, cameras)
 
 
 def save_cameras(
@@ -135,8 +137,9 @@ def save_cameras(
 ) -> None:
     """Write cameras, by name, to a file that `load_cameras` reads back to the last bit; replace an old file atomically.
     `comment` comes first in the file; `covariance`: of a joint fit; cameras named in `unplaced` get no R and T. Raises
-    CameraError (a model that is not in MODELS), OutputError (a file that cannot be written).
+    CameraError (a model that is not in MODELS, a name that is refused), OutputError (a file that cannot be written).
     """
+    check_camera_names(cameras, f"{path}, cameras")
     document: dict[str, Any] = {"cameras": {name: _described(camera) for name, camera in cameras.items()}}
     for name in unplaced:
         del document["cameras"][name]["R"], document["cameras"][name]["T"]
@@ -200,11 +203,14 @@ def _covariance_keys(covariance: ParameterCovariance | None) -> dict[str, Any]:
     return {"covariance": {"parameters": list(covariance.names), "matrix": covariance.matrix.tolist()}}
 
 
-def _independent(cameras: Mapping[str, Camera]) -> ParameterCovariance | None:
-    """Return the cameras' own covariances as diagonal blocks; None if a camera has none."""
-    parts = {name: camera.covariance for name, camera in cameras.items() if camera.covariance is not None}
-    if not parts or len(parts) < len(cameras):
-        return None
-    names = tuple(f"{name}.{parameter}" for name, covariance in parts.items() for parameter in covariance.names)
-    whole = block_diag(*(covariance.matrix.numpy() for covariance in parts.values()))
-    return ParameterCovariance(names=names, matrix=torch.from_numpy(whole))
+def _with_own(joint: ParameterCovariance | None, cameras: Mapping[str, Camera]) -> ParameterCovariance | None:
+    """Add to a joint covariance those of cameras that it does not name, as diagonal blocks; None if one has none."""
+    names, blocks = ([], []) if joint is None else ([*joint.names], [joint.matrix])
+    inside = {name.rpartition(".")[0] for name in names}
+    for name, camera in cameras.items():
+        if name not in inside:
+            if camera.covariance is None:
+                return None
+            names += [f"{name}.{parameter}" for parameter in camera.covariance.names]
+            blocks.append(camera.covariance.matrix)
+    return ParameterCovariance(names=tuple(names), matrix=torch.from_numpy(block_diag(*blocks))) if names else None

@@ -225,7 +225,7 @@ def _picture(path: Path) -> Photograph:
                 got, do = f"{picture.width} x {picture.height}", "crop it to the ball"
                 expected = f"a picture of at most {MOST_PIXELS / 1e6:g} million pixels"
                 raise PaintError(refusal(str(path), expected=expected, got=got, do=do))
-            return np.asarray(picture.convert("RGB"))
+            return np.asarray(picture if picture.mode[0] in "IF" else picture.convert("RGB"))  # 16 bit as they are
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         expected = "a picture that can be decoded"
         raise PaintError(refusal(str(path), expected=expected, got=error_words(error), do=do)) from None

@@ -1,5 +1,6 @@
 import math
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -7,7 +8,7 @@ from spin_examples import dot_directions, photograph
 
 from sphereorient import so3
 from sphereorient.errors import PaintError, ShapeError
-from sphereorient.tools.spin.disks import BallOutline, Photographs, find_disk
+from sphereorient.tools.spin.disks import BallOutline, Photographs, find_disk, load_photographs
 from sphereorient.tools.spin.dots import DotTable
 
 
@@ -113,3 +114,18 @@ def test_outlines_that_are_given_are_not_searched():
     disks, found = Photographs(pictures=pictures, time_s=torch.arange(3), balls=balls).disks(32)
     assert disks.shape == (3, 32, 32)
     assert found == tuple(balls)
+
+
+@pytest.mark.parametrize("ending", ["png", "tif"])
+def test_photographs_of_16_bits_keep_their_levels(tmp_path, ending):
+    """Before: all levels above 255 were white, and no ball was found."""
+    grey = photograph(torch.eye(3), dot_directions())[..., 0].astype(np.uint16) * 200
+    paths = [tmp_path / f"{k}.{ending}" for k in range(3)]
+    for path in paths:
+        cv2.imwrite(str(path), grey)
+    loaded = load_photographs(paths, "100")
+    np.testing.assert_array_equal(loaded.pictures[0], grey)
+    disks, (found, *_) = loaded.disks(32)
+    assert (found.u_px, found.v_px, found.radius_px) == pytest.approx((33.0, 32.0, 29.0), abs=0.6)
+    plain = Photographs(pictures=[grey / 200] * 3, time_s=torch.arange(3), balls=[found] * 3).disks(32)[0]
+    torch.testing.assert_close(disks, 200 * plain, rtol=1e-4, atol=0.1)
