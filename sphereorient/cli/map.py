@@ -82,7 +82,7 @@ def map_(given: _MapOptions) -> None:
     for name, result in results.items():
         if name:
             typer.echo(f"ball {name}")
-        _print(result)
+        print_map(result)
         if result.comparison is not None:
             _print_moved(result.comparison, f"against {given.init}")
             typer.echo(f"kept from the old map, not seen here: {100 * result.kept_share:.0f} % of the sphere")
@@ -118,7 +118,8 @@ def _write(result: "MapResult", old: "Tensor | None", out: Path) -> list[Path]:
     return [out, seen, learnt, figure, moved]
 
 
-def _print(result: "MapResult") -> None:
+def print_map(result: "MapResult") -> None:
+    """Print what was learnt; frames by the experiment's numbers."""
     from sphereorient.report.frame_warnings import frame_numbers
     from sphereorient.report.texture_map import shares_seen
 

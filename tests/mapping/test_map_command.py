@@ -17,7 +17,7 @@ from renders import error_deg
 
 from sphereorient import so3
 from sphereorient.cli.app import progress_bar
-from sphereorient.cli.map import _print as print_map
+from sphereorient.cli.map import print_map
 from sphereorient.experiment.recording import open_recording
 from sphereorient.files.whole_file import writing
 from sphereorient.mapping import MapSettings

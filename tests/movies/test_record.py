@@ -178,7 +178,9 @@ if __name__ == "__main__":
         recorder.take(0.1 * k, picture, recorder.room())
     if sys.argv[2] == "SIGKILL":
         os.kill(os.getpid(), signal.SIGKILL)
-    os.killpg(0, getattr(signal, sys.argv[2]))
+    number = getattr(signal, sys.argv[2])
+    signal.signal(number, signal.SIG_DFL)  # a program under nohup ignores SIGHUP
+    os.killpg(0, number)
     time.sleep(60)
 """
 
