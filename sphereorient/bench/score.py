@@ -16,7 +16,7 @@ from sphereorient.statistics.behaviour import Behaviour, Reference, behaviour_of
 from sphereorient.statistics.segments import TRANSLATION
 from sphereorient.trajectory import Tracks, Trajectory
 from sphereorient.trajectory.datasets import nearest_rows
-from sphereorient.trajectory.rotations import distance_deg, rotation_vectors, rotations
+from sphereorient.trajectory.rotations import distance_deg, nearest_rotations, rotation_vectors, rotations
 from sphereorient.trajectory.walk import FICTRAC
 
 Floats = NDArray[np.float64]
@@ -305,15 +305,8 @@ def _alignment(measured: Floats, true: Floats, align: str) -> tuple[Floats, Floa
     right, products = measured[0].T @ true[0], np.einsum("nim,njl->ijlm", true, measured)
     for _ in range(ITERATIONS if align == "both" else 1):  # short tracks about one axis converge slowly
         if align == "both":
-            left = _nearest(np.einsum("ijlm,lm->ij", products, right))
-        before, right = right, _nearest(np.einsum("ijlm,ij->lm", products, left))
+            left = nearest_rotations(np.einsum("ijlm,lm->ij", products, right))
+        before, right = right, nearest_rotations(np.einsum("ijlm,ij->lm", products, left))
         if np.abs(right - before).max() < CONVERGED:
             break
     return left, right
-
-
-def _nearest(matrix: Floats) -> Floats:
-    """Return the rotation nearest to a sum of rotations (3, 3): that of the least squared chords to them."""
-    U, _, Vt = np.linalg.svd(matrix)
-    U[:, 2] *= np.linalg.det(U @ Vt)
-    return np.asarray(U @ Vt, np.float64)

@@ -127,15 +127,19 @@ def with_systematic_errors(
     return replace(track, position_systematic_cov=place.numpy(), orientation_systematic_cov=turn.numpy())
 
 
+def lasting_in_use(use: Tensor, covariance: Tensor, alone: Tensor) -> Tensor:
+    """Return the lasting errors (N, 6, 6) of poses by the cameras in use, (N, C) bool; see `with_lasting_errors`."""
+    # Errors of the cameras are independent: fewer cameras in use average them less.
+    together = (use.shape[1] / use.sum(1).clamp_min(min(2, use.shape[1])))[:, None, None] * covariance
+    single = (use.to(torch.float64) @ alone.flatten(1)).reshape(-1, 6, 6)
+    return torch.where((use.sum(1) == 1)[:, None, None], single, together)
+
+
 def with_lasting_errors(track: Trajectory, covariance: Tensor, alone: Tensor) -> Trajectory:
     """Add the errors common to all frames, which no path averages away, to the covariances of the poses.
     Covariances of delta (rad, lab) and position (mm): (6, 6) by all cameras together, (C, 6, 6) by each alone.
     """
-    use = torch.from_numpy(track.believed)
-    # Errors of the cameras are independent: fewer cameras in use average them less.
-    together = (use.shape[1] / use.sum(1).clamp_min(min(2, use.shape[1])))[:, None, None] * covariance
-    single = (use.to(torch.float64) @ alone.flatten(1)).reshape(-1, 6, 6)
-    whole = torch.where((use.sum(1) == 1)[:, None, None], single, together).numpy()
+    whole = lasting_in_use(torch.from_numpy(track.believed), covariance, alone).numpy()
     turn, place = whole[:, :3, :3], whole[:, 3:, 3:]
     return replace(
         track,

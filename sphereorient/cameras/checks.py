@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from sphereorient.errors import CameraError, ShapeError, SphereOrientError, check_tail, refusal
+from sphereorient.files.hdf5 import names_a_group
 from sphereorient.files.yaml_file import refuse_unknown, short
 
 ROTATION_TOLERANCE = 1e-5  # of |R R^T - I|: moves a point at the rim of a 1000 px picture by less than 0.01 px
@@ -51,9 +52,8 @@ def check_rotation(name: str, R: Tensor, most: float = ROTATION_TOLERANCE, do: s
 
 def check_camera_names(names: Iterable[str], where: str) -> None:
     """Refuse names that cannot be names of groups in track.h5: empty ones, '.', and names with '/' (CameraError)."""
-    for name in names:
-        if not name.strip() or "/" in name or name == ".":
-            raise camera_error(where, "names without '/'", short(name), "give each camera a name, such as cam1")
+    for name in (one for one in names if not names_a_group(one)):
+        raise camera_error(where, "names without '/'", short(name), "give each camera a name, such as cam1")
 
 
 def check_points(name: str, points: Tensor, size: int) -> None:

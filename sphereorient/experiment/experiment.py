@@ -12,7 +12,7 @@ from sphereorient.cameras import Camera, ParameterCovariance, load_cameras, load
 from sphereorient.cameras.checks import check_known
 from sphereorient.cameras.response import Response
 from sphereorient.errors import ExperimentError, MovieError, refusal
-from sphereorient.files.hdf5 import UNNAMED
+from sphereorient.files.hdf5 import UNNAMED, names_a_group
 from sphereorient.files.yaml_file import read_document, short, validated
 from sphereorient.movies import Movie, flipped, is_movie, movie_files, open_movie
 from sphereorient.sphere import seen_path
@@ -329,15 +329,21 @@ def response_of(where: str, given: Any) -> Response:
     raise input_error(where, expected, short(given), "write one of these, or remove the key: it is then learnt")
 
 
+def check_exposure(path: Path, exposure_s: float | None, frame_s: float, tolerance: float = 0.0) -> None:
+    """Refuse an exposure longer than the time between frames, by more than a relative tolerance (ExperimentError)."""
+    if exposure_s is not None and exposure_s > frame_s * (1 + tolerance):
+        expected = f"at most the time between frames, {frame_s:.4g} s"
+        raise input_error(f"{path}, exposure", expected, f"{exposure_s:g}", "write it in seconds")
+
+
 def _check_numbers(path: Path, keys: ExperimentKeys) -> None:
     if (keys.frame_rate is None) == (keys.times is None):
         got, do = "neither" if keys.times is None else "both", "write frame_rate: in Hz, or times: with a file"
         raise input_error(str(path), "either frame_rate or times", got, do)
     if keys.frames is not None and keys.frames[0] >= keys.frames[1]:
         raise input_error(f"{path}, frames", "first below last", str(keys.frames), "write first and last + 1")
-    if keys.exposure is not None and keys.frame_rate is not None and keys.exposure > 1 / keys.frame_rate:
-        expected = f"at most the time between frames, {1 / keys.frame_rate:.4g} s"
-        raise input_error(f"{path}, exposure", expected, f"{keys.exposure:g}", "write it in seconds")
+    if keys.frame_rate is not None:
+        check_exposure(path, keys.exposure, 1 / keys.frame_rate)
     for name, device in keys.camera.items():
         if device.exposure_ms and device.rate_hz and device.exposure_ms > 1e3 / device.rate_hz:
             where, expected = f"{path}, camera.{name}.exposure_ms", f"at most {1e3 / device.rate_hz:.4g} ms, by rate_hz"
@@ -352,7 +358,7 @@ def _check_spheres(path: Path, keys: ExperimentKeys) -> None:
         do = "write `sphere` for one ball, else `spheres`"
         raise input_error(f"{path}, sphere", "either sphere or spheres", "both", do)
     for name, sphere in keys.spheres.items():
-        if not name.strip() or "/" in name or name == ".":
+        if not names_a_group(name):
             raise input_error(where, "names without '/'", short(name), "give each ball a name, such as a")
         if sphere.diameter is None and len(keys.spheres) > 1:
             do = "measure it: lengths of several balls are in mm"

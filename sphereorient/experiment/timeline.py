@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphereorient.errors import ExperimentError, MovieError, refusal
-from sphereorient.experiment.experiment import MOVIES_OWN, Experiment, input_error
+from sphereorient.experiment.experiment import MOVIES_OWN, Experiment, check_exposure, input_error
 from sphereorient.files.whole_file import read_text
 from sphereorient.movies import Movie
 from sphereorient.movies.stamps import UNITS, doubt, other_units, rate_of, unit_in
@@ -79,7 +79,7 @@ def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     movies`).
     """
     whole = _stamped(experiment, movies) if experiment.times == MOVIES_OWN else _counted(experiment, movies)
-    _check_exposure(experiment, whole)
+    check_exposure(experiment.path, experiment.exposure_s, _longest_step(whole), EVEN_STEPS)
     whole = replace(whole, remarks=(*whole.remarks, *_questioned(experiment, whole.frame_s, movies)))
     if experiment.frames is None:
         return whole
@@ -91,13 +91,10 @@ def timeline(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:
     return replace(whole, number=whole.number[first:last], time_s=whole.time_s[first:last], rows=rows)
 
 
-def _check_exposure(experiment: Experiment, whole: Timeline) -> None:
+def _longest_step(whole: Timeline) -> float:
+    """Return the longest of the cameras' median times between pictures, s."""
     seen_s = [np.diff(whole.time_s[row != NONE]) for row in whole.rows.values()]
-    frame_s = max((float(np.median(steps)) for steps in seen_s if len(steps)), default=math.inf)
-    if experiment.exposure_s is not None and experiment.exposure_s > frame_s * (1 + EVEN_STEPS):
-        expected = f"at most the time between frames, {frame_s:.4g} s"
-        got, do = f"{experiment.exposure_s:g}", "write it in seconds"
-        raise input_error(f"{experiment.path}, exposure", expected, got, do)
+    return max((float(np.median(steps)) for steps in seen_s if len(steps)), default=math.inf)
 
 
 def _counted(experiment: Experiment, movies: Mapping[str, Movie]) -> Timeline:

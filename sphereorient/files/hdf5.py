@@ -42,6 +42,11 @@ def digest(file: h5py.File) -> str:
     return total.hexdigest()
 
 
+def names_a_group(name: str) -> bool:
+    """Return whether a name can be that of a group in a track: not empty, not '.', without '/'."""
+    return bool(name.strip()) and "/" not in name and name != "."
+
+
 def ball_group(file: h5py.File, name: str) -> h5py.Group:
     """Return a new group for a ball; the file itself for an unnamed one."""
     return file.create_group(f"{SPHERES}/{name}") if name else file

@@ -3,6 +3,7 @@ import math
 import struct
 import warnings
 from abc import ABC, abstractmethod
+from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,6 @@ from tifffile import TiffFile, TiffFileError
 from sphereorient.files.whole_file import put_aside
 
 TIFF_SIZE = (256, 257)  # the tags of width and height
-TIFF_BEGINS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 WHITE_IS_ZERO, SEPARATE = 0, 2  # PhotometricInterpretation, PlanarConfiguration
 EXIF, FOCAL_35MM, EXIF_SIZE = 0x8769, 0xA405, (0xA002, 0xA003)  # the block of tags, and its tags
 FILM_MM = 43.27  # diagonal of 35 mm film
@@ -87,15 +87,11 @@ def decoded_grey(content: bytes) -> NDArray[Any] | None:
 
 def _misread(content: bytes) -> bool:
     """Return whether OpenCV decodes a TIFF file wrongly: deeper than 8 bit, with white as 0 or colours in planes."""
-    if content[:4] not in TIFF_BEGINS:
-        return False
-    try:
-        with TiffFile(BytesIO(content)) as file:
-            page: Any = file.pages[0]
-            planes = page.samplesperpixel > 1 and page.planarconfig == SEPARATE
-            return bool(page.dtype.itemsize > 1 and (page.photometric == WHITE_IS_ZERO or planes))
-    except FAULTS:
-        return False
+    with suppress(*FAULTS), TiffFile(BytesIO(content)) as file:  # a fault: another format, or a damaged file
+        page: Any = file.pages[0]
+        planes = page.samplesperpixel > 1 and page.planarconfig == SEPARATE
+        return bool(page.dtype.itemsize > 1 and (page.photometric == WHITE_IS_ZERO or planes))
+    return False
 
 
 def vertical_field_deg(path: Path) -> float | None:

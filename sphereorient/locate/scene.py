@@ -93,8 +93,8 @@ def find_scenes(
     each = {name: recording.of(name) for name in recording.experiment.names}
     sizes = {name: known_diameter_px(one, stream, settings) for name, one in each.items()}
     empty, background, outline = given_scene(recording.experiment, stream.name, stream.movie.frame_shape), None, None
-    photograph = stream.photograph and len(each) == 1
-    in_place = photograph or (len(each) == 1 and recording.experiment.sphere.in_place)
+    photograph = stream.photograph and recording.experiment.alone
+    in_place = photograph or (recording.experiment.alone and recording.experiment.sphere.in_place)
     if in_place and (empty is None or None in sizes.values()):
         sways = not recording.experiment.fixed
         fixed = partial(fixed_ball, circle=recording.experiment.circles.get(stream.name))

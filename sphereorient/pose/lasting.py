@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from sphereorient import so3
+from sphereorient.calibration.systematic import lasting_in_use
 from sphereorient.pose.compiled import fitted_residuals
 from sphereorient.pose.lights.disk import RIDGE, glint_cells, glint_shares, light_columns
 from sphereorient.pose.model import IN_SIGHT, SphereModel, by_pose
@@ -46,11 +47,7 @@ class Lasting:
 
     def of_use(self, use: Tensor) -> Tensor:
         """Return the covariance (6, 6) of a pose by the cameras in use, (C,) bool."""
-        count = int(use.sum())
-        if count == 1:
-            return self.alone[use][0]
-        # Errors of the cameras are independent, as in `with_lasting_errors`.
-        return self.covariance * (len(use) / max(count, min(2, len(use))))
+        return lasting_in_use(use[None], self.covariance, self.alone)[0]
 
     def widened(self, one: FittedPoses, other: FittedPoses, use: Tensor) -> "Lasting":
         """Return errors that include the mean difference of B poses between two equally good models, `use` (B, C)."""

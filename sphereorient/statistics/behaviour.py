@@ -10,7 +10,7 @@ from sphereorient.errors import ShapeError, refusal
 from sphereorient.statistics.bootstrap import Floats, Interval, Rows, bootstrap, segment_sums
 from sphereorient.statistics.settings import BootstrapSettings
 from sphereorient.trajectory import Trajectory
-from sphereorient.trajectory.rotations import rotation_vectors
+from sphereorient.trajectory.rotations import nearest_rotations, rotation_vectors
 from sphereorient.trajectory.walk import arcs, walk_of
 
 Mask = NDArray[np.bool_]
@@ -205,9 +205,8 @@ def _errors(R: Floats, R_reference: Floats, first: Rows, of: Rows) -> Floats:
     frames of each stretch, to R; they may exceed half a turn. `first` (S,): where a stretch begins; `of` (K,).
     """
     early = np.arange(len(R)) - first[of] < PER_BLOCK
-    U, _, Vt = np.linalg.svd(segment_sums((R_reference.mT @ R)[early], of[early], len(first)))
-    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
-    E = R @ (R_reference @ (U @ Vt)[of]).mT
+    body = nearest_rotations(segment_sums((R_reference.mT @ R)[early], of[early], len(first)))
+    E = R @ (R_reference @ body[of]).mT
     error = rotation_vectors(E)
     # The branch of the rotation vector nearest to the sum of the changes, which itself accumulates noise.
     change = np.concatenate([error[:1], _turns(E)])

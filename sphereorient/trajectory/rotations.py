@@ -24,6 +24,13 @@ def rotations(vectors: Floats) -> Floats:
     return np.asarray(so3.exp(torch.from_numpy(np.ascontiguousarray(vectors))).numpy(), np.float64)
 
 
+def nearest_rotations(M: Floats) -> Floats:
+    """Return the rotations (..., 3, 3) nearest to matrices, as sums of rotations are: the mean by squared chords."""
+    U, _, Vt = np.linalg.svd(M)
+    U[..., 2] *= np.linalg.det(U @ Vt)[..., None]
+    return np.asarray(U @ Vt, np.float64)
+
+
 def distance_rad(A: Floats, B: Floats) -> Floats:
     """Return the angles (N,), rad, between orientations (N, 3, 3)."""
     return np.asarray(so3.geodesic_distance(torch.from_numpy(A), torch.from_numpy(B)).numpy(), np.float64)

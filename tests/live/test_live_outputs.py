@@ -349,26 +349,28 @@ def test_an_lsl_reader_that_does_not_read_holds_nothing_up(stream):
     reader.close_stream()
 
 
-def test_lsl_times_are_those_of_the_source_less_the_least_delay(monkeypatch):
+@pytest.fixture
+def lsl_times(monkeypatch):
+    """A stream with a clock that the test sets, and the times of its samples."""
     pytest.importorskip("pylsl", reason="the extra `live`")
     pushed: list[float] = []
     clock = SimpleNamespace(now_s=100.0)
     stream = LslOutput("ball", pytest.fail)
     monkeypatch.setattr("pylsl.local_clock", lambda: clock.now_s)
     monkeypatch.setattr("pylsl.StreamOutlet.push_sample", lambda self, values, time_s: pushed.append(time_s))
+    return stream, clock, pushed
+
+
+def test_lsl_times_are_those_of_the_source_less_the_least_delay(lsl_times):
+    stream, clock, pushed = lsl_times
     for k, late_s in enumerate((0.004, 0.0, 0.03, 0.001)):  # on the way from the exposure
         clock.now_s = 100.0 + 1e-3 * k + late_s + 0.002
         stream.send(numbers(k))
     assert pushed == pytest.approx([100.004, 100.001, 100.002, 100.003])
 
 
-def test_lsl_times_go_on_where_the_source_begins_again(monkeypatch):
-    pytest.importorskip("pylsl", reason="the extra `live`")
-    pushed: list[float] = []
-    clock = SimpleNamespace(now_s=100.0)
-    stream = LslOutput("ball", pytest.fail)
-    monkeypatch.setattr("pylsl.local_clock", lambda: clock.now_s)
-    monkeypatch.setattr("pylsl.StreamOutlet.push_sample", lambda self, values, time_s: pushed.append(time_s))
+def test_lsl_times_go_on_where_the_source_begins_again(lsl_times):
+    stream, clock, pushed = lsl_times
     for k in (*range(900), *range(90)):
         clock.now_s += 0.001
         stream.send(numbers(k))
