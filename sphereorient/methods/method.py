@@ -131,7 +131,7 @@ class Learnt:
 
 
 def _shown(scene: CameraScene, stream: CameraStream) -> CameraScene:
-    """Return a learnt scene with the mask of the experiment."""
+    """Return a learnt scene with the mask of the experiment. Raises TrackError: the responses differ."""
     if stream.response not in (None, scene.response):
         got, do = str(scene.response or "linear"), "learn anew: leave --learnt out"
         name = f"learnt, response of {stream.name}"

@@ -25,7 +25,7 @@ def rotations(vectors: Floats) -> Floats:
 
 
 def nearest_rotations(M: Floats) -> Floats:
-    """Return the rotations (..., 3, 3) nearest to matrices, as sums of rotations are: the mean by squared chords."""
+    """Return the rotations nearest to finite matrices (..., 3, 3): `so3.nearest_rotation` without its derivative."""
     U, _, Vt = np.linalg.svd(M)
     U[..., 2] *= np.linalg.det(U @ Vt)[..., None]
     return np.asarray(U @ Vt, np.float64)
