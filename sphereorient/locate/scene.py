@@ -1,3 +1,4 @@
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -64,15 +65,17 @@ class CameraScene:
 
 
 def known_diameter_px(recording: Recording, stream: CameraStream, settings: LocateSettings) -> float | None:
-    """Return the expected diameter, px; None if only the movie can show it; raises as `expected_diameter_px`."""
+    """Return the expected diameter, px; None if only the pictures can show it; raises as `expected_diameter_px`."""
     if settings.diameter_px is not None:
         return settings.diameter_px
-    experiment = recording.experiment
+    experiment, cameras = recording.experiment, recording.cameras
     # Of one picture alone the distance is not known either.
     alone = recording.photograph and stream.name not in experiment.background_paths
-    if alone or (experiment.diameter_mm is None and (recording.photograph or experiment.sphere.in_place)):
+    in_place = recording.photograph or experiment.sphere.in_place
+    seen = len(cameras) > 1 or bool(stream.camera.project(torch.zeros(3, dtype=torch.float64)).isfinite().all())
+    if alone or (in_place and (experiment.diameter_mm is None or not seen)):  # seen: the lab's origin
         return None
-    return expected_diameter_px(stream.name, recording.cameras, experiment.diameter_mm)
+    return expected_diameter_px(stream.name, cameras, experiment.diameter_mm)
 
 
 def find_scenes(
@@ -134,7 +137,8 @@ def expected_diameter_px(name: str, cameras: Mapping[str, Camera], diameter_mm: 
     rim = camera.project(torch.stack([middle - aside_lab, middle + aside_lab]))
     diameter_px = float((rim[1] - rim[0]).norm())
     if not 4 < diameter_px < max(camera.image_size):
-        got = f"a sphere of {diameter_px:.3g} px in the middle of the volume"
+        size = f"a sphere of {diameter_px:.3g} px in the middle of the volume"
+        got = "the middle of the volume out of its sight" if math.isnan(diameter_px) else size
         raise SettingsError(refusal(f"camera {name}", expected="a sphere that fits the picture", got=got, do=do))
     return diameter_px
 

@@ -12,7 +12,7 @@ from sphereorient.experiment import Experiment
 from sphereorient.experiment.recording import CameraStream, Recording, given_scene, open_recording
 from sphereorient.experiment.timeline import Timeline
 from sphereorient.files.threads import Progress, silent
-from sphereorient.locate import expected_diameter_px, find_scenes
+from sphereorient.locate import find_scenes, known_diameter_px
 from sphereorient.methods.proposers import as_near
 from sphereorient.methods.settings import Settings
 from sphereorient.preflight import cameras, movies, texture_map
@@ -159,16 +159,14 @@ def _texture_findings(seen: Preflight) -> Iterator[Finding]:
 
 def _expected_sizes(recording: Recording, settings: Settings) -> tuple[dict[str, float | None], list[Finding]]:
     """Return the expected diameter in each camera, px, None if unknown, and findings for impossible ones."""
-    experiment, unknown = recording.experiment, settings.locate.diameter_px is None and not recording.photograph
-    sizes: dict[str, float | None] = dict.fromkeys(experiment.cameras, settings.locate.diameter_px)
+    sizes: dict[str, float | None] = dict.fromkeys(recording.experiment.cameras, settings.locate.diameter_px)
     findings = []
-    if unknown and experiment.diameter_mm is not None:
-        for name in experiment.cameras:
-            try:
-                sizes[name] = expected_diameter_px(name, experiment.cameras, experiment.diameter_mm)
-            except SettingsError as error:
-                advice = "check sphere.diameter and the lengths in cameras.yaml: all are mm"
-                findings.append(judged(f"expected size {name}", str(error), (True, FAULT, advice)))
+    for stream in recording.streams if recording.experiment.diameter_mm is not None else ():
+        try:
+            sizes[stream.name] = known_diameter_px(recording, stream, settings.locate)
+        except SettingsError as error:
+            advice = "check sphere.diameter and the lengths in cameras.yaml: all are mm"
+            findings.append(judged(f"expected size {stream.name}", str(error), (True, FAULT, advice)))
     return sizes, findings
 
 

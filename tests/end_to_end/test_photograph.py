@@ -105,18 +105,30 @@ def test_a_ball_that_fills_most_of_the_picture_is_found(still, share):
     assert abs(float(inside) - float(np.median(grey[:5]))) < 3  # of the surroundings, not of the ball
 
 
-@pytest.mark.parametrize("empty", [True, False])
-def test_the_cameras_give_the_size_in_one_picture_only_with_the_empty_scene(still, tmp_path, empty):
+@pytest.mark.parametrize("fixed", [True, False], ids=["movie of a fixed ball", "one picture"])
+@pytest.mark.parametrize("empty", [True, False], ids=["empty scene", "guessed background"])
+@pytest.mark.parametrize("placed", [True, False], ids=["placed", "camera at the lab's origin"])
+def test_the_cameras_give_the_size_if_they_are_placed_and_one_picture_has_its_empty_scene(
+    still, tmp_path, fixed, empty, placed
+):
     shutil.copytree(still, tmp_path / "one")
-    path = tmp_path / "one" / "experiment.yaml"
+    path, picture = tmp_path / "one" / "experiment.yaml", photograph(tmp_path / "one")
     document = yaml.safe_load(path.read_text("utf-8"))
+    if fixed:
+        shutil.copy(picture, picture.with_stem("001"))
+        document["sphere"]["fixed"] = True
     if empty:
-        cv2.imwrite(str(path.with_name("empty.png")), np.full_like(cv2.imread(str(photograph(still)), 0), 40))
+        cv2.imwrite(str(path.with_name("empty.png")), np.full_like(cv2.imread(str(picture), 0), 40))
         document["backgrounds"] = {"cam1": "empty.png"}
+    if not placed:
+        known = yaml.safe_load((cameras := path.with_name("cameras.yaml")).read_text("utf-8"))
+        known["cameras"]["cam1"]["T"] = [0.0, 0.0, 0.0]
+        cameras.write_text(yaml.safe_dump(known), "utf-8")
     path.write_text(yaml.safe_dump(document), "utf-8")
     with open_recording(path, textured=False) as recording:
         size_px = known_diameter_px(recording, recording.streams[0], LocateSettings())
-    assert size_px == pytest.approx(Stills(count=1, seed=5).diameter_px, rel=0.01) if empty else size_px is None
+    expected = pytest.approx(Stills(count=1, seed=5).diameter_px, rel=0.01)
+    assert size_px == (expected if placed and (empty or fixed) else None)
 
 
 def test_a_photograph_without_a_ball_is_one_line():

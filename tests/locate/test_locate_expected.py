@@ -48,7 +48,7 @@ def test_an_unknown_diameter_is_refused():
 @pytest.mark.parametrize("depth", [0.0, -100.0])
 def test_a_camera_that_does_not_see_the_origin_is_refused(depth):
     camera = looking_along_y(T_cam_lab_mm=torch.tensor([0.0, 0.0, depth], dtype=torch.float64))
-    with pytest.raises(SettingsError, match=r"camera cam1.*locate\.diameter_px"):
+    with pytest.raises(SettingsError, match=r"camera cam1.*out of its sight.*locate\.diameter_px"):
         expected_diameter_px("cam1", {"cam1": camera}, 18.0)
 
 
