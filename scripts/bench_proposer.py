@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 import torch
@@ -295,7 +296,7 @@ def write_docs(found: Mapping[str, Mapping[str, Found]]) -> None:
     page = DOCS / "proposer.md"
     text = page.read_text("utf-8")
     head, tail = text.split(BEGIN)[0], text.split(END)[1]
-    sentence = f"\n\n{calibration(found[MIXED])}\n" if MIXED in found else "\n"
+    sentence = f"\n\n{fill(calibration(found[MIXED]), 120)}\n" if MIXED in found else "\n"
     page.write_text(f"{head}{BEGIN}\n" + "\n".join(lines) + sentence + f"{END}{tail}", "utf-8")
     place = DOCS.parent / "out" / "proposer-bench"
     place.parent.mkdir(exist_ok=True)

@@ -253,8 +253,8 @@ def _turn_and_move(p: Floats) -> list[float]:
 
 def _widths(p: Floats) -> list[float]:
     """Return the relative changes of width, sx and pixel_pitch along u, per cent, of the parameter of `_wide`."""
-    wider = 1 + float(p[0])
-    return [100 * (wider - 1), 100 * (wider - 1), 100 * (1 / wider - 1)]
+    wider = float(p[0])
+    return [100 * wider, 100 * wider, 100 * (1 / (1 + wider) - 1)]
 
 
 def _wide(compare: Comparison, some: Sequence[int], p: Floats) -> Tensor:

@@ -25,10 +25,8 @@ def rotations(vectors: Floats) -> Floats:
 
 
 def nearest_rotations(M: Floats) -> Floats:
-    """Return the rotations nearest to finite matrices (..., 3, 3): `so3.nearest_rotation` without its derivative."""
-    U, _, Vt = np.linalg.svd(M)
-    U[..., 2] *= np.linalg.det(U @ Vt)[..., None]
-    return np.asarray(U @ Vt, np.float64)
+    """Return the rotations (..., 3, 3) nearest to matrices, as `so3.nearest_rotation`."""
+    return np.asarray(so3.nearest_rotation(torch.from_numpy(M)).numpy(), np.float64)
 
 
 def distance_rad(A: Floats, B: Floats) -> Floats:
