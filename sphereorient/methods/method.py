@@ -133,7 +133,7 @@ class Learnt:
 def _shown(scene: CameraScene, stream: CameraStream) -> CameraScene:
     """Return a learnt scene with the mask of the experiment. Raises TrackError: the responses differ."""
     if stream.response not in (None, scene.response):
-        got, do = str(scene.response or "linear"), "learn anew: leave --learnt out"
+        got, do = str(scene.response or "an unknown one"), "learn anew: leave --learnt out"
         name = f"learnt, response of {stream.name}"
         raise TrackError(refusal(name, expected=str(stream.response), got=got, do=do))
     return replace(scene, background=replace(scene.background, shown=stream.shown))

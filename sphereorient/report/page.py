@@ -44,7 +44,7 @@ def page_html(summary: Summary, tracks: Mapping[str, Trajectory], command: str, 
         "title": f"{what}: {_some(names)}" if names else what,
         "subtitle": f"{_some(list(tracks))}; made {datetime.now(UTC).isoformat(' ', 'minutes')[:16]} UTC",
         "tiles": _tiles(summary, tracks),
-        "each": _each(tables["tracks"]) if len(tracks) > 1 else None,
+        "each": _each(tables["tracks"], next(iter(tracks.values())).length_unit) if len(tracks) > 1 else None,
         "grids": [grid for grid in (_behaviour(tables), *_moments(summary), _flow(tables)) if grid["rows"]],
         "settings": str(yaml.safe_dump(settings, sort_keys=False)).rstrip(),
         "provenance": [_provenance(name, track) for name, track in tracks.items()],
@@ -126,8 +126,7 @@ def _tiles(summary: Summary, tracks: Mapping[str, Trajectory]) -> list[tuple[str
     return found
 
 
-def _each(tracks: Table) -> Grid:
-    length = "mm" if "stated_error_mm" in tracks.rows[0] else "radii"
+def _each(tracks: Table, length: str) -> Grid:
     shown = {
         "frames": "frames",
         "valid": "valid",
