@@ -129,7 +129,7 @@ def test_an_experiment_that_kills_every_worker_is_given_up(tmp_path, settings):
 
 @pytest.mark.slow
 def test_a_dask_cluster_gives_the_same_bytes_and_survives_a_dead_worker(tmp_path, settings, alone):
-    pytest.importorskip("distributed")
+    pytest.importorskip("distributed", exc_type=ImportError)
     bad = broken(tmp_path / "bad")
     requests = [
         Request(experiment=experiment, out=tmp_path / f"{name}.h5", settings=settings)
@@ -160,7 +160,7 @@ def test_a_dask_cluster_gives_the_same_bytes_and_survives_a_dead_worker(tmp_path
 
 
 def test_a_cluster_that_is_not_there_is_one_line():
-    pytest.importorskip("distributed")
+    pytest.importorskip("distributed", exc_type=ImportError)
     with pytest.raises(SettingsError, match=r"Dask scheduler.*docs/long-runs\.md") as refused:
         dask_executor("nonsense://nowhere")
     assert "\n" not in str(refused.value)
