@@ -46,8 +46,9 @@ BORDER = 0.03  # of the shorter side: border of a photograph, which shows the su
 LARGEST, SMALLEST_PX, SIZES = 1.2, 30.0, 1.4  # of the shorter side; px, as paint of smaller balls is unreadable; ratio
 
 OUTLINES_MIN = 8  # least number for a scatter
-# A ball whose outlines scatter by more than all of these is not fixed: px; of the radius; of their errors.
 GIVEN_PX = 0.5  # error of a given outline
+CHECK_POSE = "check R and T of the cameras (X_cam = R X_lab + T), and which movie belongs to which"
+# A ball whose outlines scatter by more than all of these is not fixed: px; of the radius; of their errors.
 WANDER_PX, WANDER_SHARE, WANDER_SURE = 1.0, 0.02, 2.0
 
 DiskFinder = Callable[[NDArray[Any], Background], list[Outline]]  # disks in a picture (H, W)
@@ -137,8 +138,9 @@ def expected_diameter_px(name: str, cameras: Mapping[str, Camera], diameter_mm: 
     rim = camera.project(torch.stack([middle - aside_lab, middle + aside_lab]))
     diameter_px = float((rim[1] - rim[0]).norm())
     if not 4 < diameter_px < max(camera.image_size):
-        size = f"a sphere of {diameter_px:.3g} px in the middle of the volume"
-        got = "the middle of the volume out of its sight" if math.isnan(diameter_px) else size
+        got = f"a sphere of {diameter_px:.3g} px in the middle of the volume"
+        if math.isnan(diameter_px):
+            got, do = "the middle of the volume out of its sight", CHECK_POSE if len(cameras) > 1 else do
         raise SettingsError(refusal(f"camera {name}", expected="a sphere that fits the picture", got=got, do=do))
     return diameter_px
 

@@ -13,6 +13,7 @@ from torch.nn import functional as F
 
 from sphereorient import locate
 from sphereorient.cameras import R_cam_view, perspective_centre_lab_mm
+from sphereorient.cameras.checks import camera_error
 from sphereorient.errors import PaintError, Reason, refusal
 from sphereorient.experiment.recording import CameraStream, Recording, given_scene
 from sphereorient.files.threads import Progress, counted, side_by_side, silent
@@ -30,7 +31,7 @@ from sphereorient.locate import (
     smoothed,
 )
 from sphereorient.locate.outline import window_about
-from sphereorient.locate.scene import fixed_ball, wander_px
+from sphereorient.locate.scene import CHECK_POSE, fixed_ball, wander_px
 from sphereorient.mapping.settings import MapSettings
 from sphereorient.pose.camera_view import CameraView
 from sphereorient.pose.fitter import Fitter
@@ -152,8 +153,18 @@ def take_crops(recording: Recording, settings: MapSettings, locating: LocateSett
 
 
 def _positions(sightings: Mapping[str, Sightings], recording: Recording) -> Positions:
+    """Return the positions of a ball, NaN where a camera cannot see them. Raises CameraError: most of them."""
     locate.check_seen(sightings)
-    return find_positions(sightings, recording.cameras, recording.experiment.diameter_mm)
+    found = find_positions(sightings, recording.cameras, recording.experiment.diameter_mm)
+    X = found.position_lab_mm
+    known = X.isfinite().all(-1)
+    for name, camera in recording.cameras.items():
+        beyond = known & ~camera.project(X).isfinite().all(-1)
+        if 2 * int(beyond.sum()) > int(known.sum()):
+            got, do = f"one behind it in {int(beyond.sum())} of {int(known.sum())} frames", CHECK_POSE
+            raise camera_error(f"camera {name}", "a ball that it sees", got, do)
+        X = torch.where(beyond[:, None], torch.nan, X)
+    return replace(found, position_lab_mm=X)
 
 
 def _scene(recording: Recording, stream: CameraStream, settings: MapSettings, locating: LocateSettings) -> CameraScene:
@@ -200,7 +211,7 @@ def held_place(
         views.append(CameraView.of(stream.name, stream.camera, scene))
         sightings[stream.name] = seen
     X = _positions(sightings, recording).position_lab_mm
-    use = torch.stack([one.placed for one in sightings.values()], 1)
+    use = torch.stack([one.placed for one in sightings.values()], 1) & torch.isfinite(X).all(1)[:, None]
     radius_mm, fixed = experiment.radius_mm, experiment.fixed
     return Crops(views=views, crops=[[] for _ in views], position_lab_mm=X, seen=use, radius_mm=radius_mm, fixed=fixed)
 

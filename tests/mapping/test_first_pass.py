@@ -2,6 +2,7 @@
 
 import math
 import re
+import shutil
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -20,14 +21,17 @@ from turning_examples import RATE_HZ, turning_ball  # noqa: F401
 from sphereorient import so3
 from sphereorient.bench.ball import SCENES, write_ball_scene
 from sphereorient.cameras import Camera, CoarserCamera, PinholeCamera, centre_lab_mm
+from sphereorient.errors import CameraError
 from sphereorient.experiment import load_experiment
+from sphereorient.experiment.recording import open_recording
 from sphereorient.files.whole_file import writing
-from sphereorient.locate import Background, CameraScene, Frame
+from sphereorient.locate import Background, CameraScene, Frame, LocateSettings, find_positions
 from sphereorient.mapping import first_pass, paint_cells
 from sphereorient.mapping.adjustment import LEVELS, adjusted, focal_ratio
-from sphereorient.mapping.disks import Crops, cut_out
+from sphereorient.mapping.disks import Crops, cut_out, held_place
 from sphereorient.mapping.first_pass import CoarserPictures, FirstPass, KeptFrames
 from sphereorient.mapping.paint_cells import BallView, PaintCells
+from sphereorient.mapping.settings import MapSettings
 from sphereorient.methods.map import first_map_of
 from sphereorient.methods.settings import Settings
 from sphereorient.movies import open_movie, write_ffv1
@@ -370,3 +374,30 @@ def test_a_ball_that_comes_late_and_leaves_is_tracked_without_a_map(tmp_path):
     R, true = torch.from_numpy(track.orientation[shows][ok]), true[: len(pictures)][ok]
     body = so3.nearest_rotation((R.mT @ true).mean(0))
     assert float(error_deg(R @ body, true).median()) < 0.5
+
+
+def test_a_ball_behind_a_camera_is_refused_with_what_to_check(tmp_path):
+    experiment = load_experiment(shutil.copytree(EXCERPT, tmp_path / "copy") / "experiment.yaml")
+    cameras = yaml.safe_load((path := experiment.folder / "cameras.yaml").read_text("utf-8"))
+    known, about_y = cameras["cameras"]["cam2"], np.diag([-1.0, 1.0, -1.0])  # half a turn of the camera in its place
+    known |= {"R": (about_y @ known["R"]).tolist(), "T": (about_y @ known["T"]).tolist()}
+    path.write_text(yaml.safe_dump(cameras), "utf-8")
+    with (
+        open_recording(experiment.path, textured=False) as recording,
+        pytest.raises(CameraError, match=r"cam2.*behind it.*R and T"),
+    ):
+        held_place(recording, MapSettings(), LocateSettings(diameter_px=76.0))
+
+
+def test_a_frame_with_the_ball_behind_a_camera_is_not_used(monkeypatch):
+    def one_behind(*arguments):
+        found = find_positions(*arguments)
+        found.position_lab_mm[3] = 2 * centre_lab_mm(recording.cameras["cam2"])
+        return found
+
+    monkeypatch.setattr("sphereorient.mapping.disks.find_positions", one_behind)
+    with open_recording(EXCERPT / "experiment.yaml", textured=False) as recording:
+        place = held_place(recording, MapSettings(), LocateSettings())
+    unseen = ~place.seen.any(1)
+    assert torch.nonzero(unseen)[:, 0].tolist() == [3]
+    assert torch.equal(unseen, place.position_lab_mm.isnan().any(1))
