@@ -161,7 +161,7 @@ def _positions(sightings: Mapping[str, Sightings], recording: Recording) -> Posi
     for name, camera in recording.cameras.items():
         beyond = known & ~camera.project(X).isfinite().all(-1)
         if 2 * int(beyond.sum()) > int(known.sum()):
-            got, do = f"one behind it in {int(beyond.sum())} of {int(known.sum())} frames", CHECK_POSE
+            got, do = f"one out of its sight in {int(beyond.sum())} of {int(known.sum())} frames", CHECK_POSE
             raise camera_error(f"camera {name}", "a ball that it sees", got, do)
         X = torch.where(beyond[:, None], torch.nan, X)
     return replace(found, position_lab_mm=X)

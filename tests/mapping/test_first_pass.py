@@ -384,7 +384,7 @@ def test_a_ball_behind_a_camera_is_refused_with_what_to_check(tmp_path):
     path.write_text(yaml.safe_dump(cameras), "utf-8")
     with (
         open_recording(experiment.path, textured=False) as recording,
-        pytest.raises(CameraError, match=r"cam2.*behind it.*R and T"),
+        pytest.raises(CameraError, match=r"cam2.*out of its sight.*R and T"),
     ):
         held_place(recording, MapSettings(), LocateSettings(diameter_px=76.0))
 
