@@ -112,8 +112,10 @@ FIGURES: dict[str, Figure] = {
     "backgrounds": Figure(pages=("paper-map.md",), command=f"compare_backgrounds.py {SHARED}/experiment"),
     "search": Figure(pages=("accuracy.md",), command=f"bench_search.py {SHARED}/experiment", last=True),
     "speed": Figure(pages=("precise.md",), command=f"bench_speed.py {SHARED}/experiment", last=True),
-    "proposer": Figure(pages=("proposer.md",), command="bench_proposer.py --docs"),
-    "designs": Figure(pages=("proposer.md",), command="proposer_designs.py --minutes 5", tables=("designs",)),
+    "proposer": Figure(pages=("proposer.md",), command="bench_proposer.py --docs", last=True),
+    "designs": Figure(
+        pages=("proposer.md",), command="proposer_designs.py --minutes 5", tables=("designs",), last=True
+    ),
     "learnt-path": Figure(pages=("assembly.md",), command="learn_path.py"),
     "learnt-path-honest": Figure(pages=("assembly.md",), command="learn_path.py --honest"),
     "maps": Figure(pages=("map.md",), command="map_accuracy.py", tables=("maps", "fictrac", "old")),
