@@ -154,9 +154,9 @@ def test_nothing_scrolls_sideways_and_the_canvas_follows_the_window(open_page, p
     with open_page(page_path, width=width) as page:
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         page.set_viewport_size({"width": width // 2 + 150, "height": 900})
-        page.wait_for_timeout(200)
-        canvas = section(page, "planted").locator(".strip__overview")
-        assert canvas.evaluate("canvas => canvas.width === Math.round(canvas.clientWidth * devicePixelRatio)")
+        canvas = section(page, "planted").locator(".strip__overview").element_handle()
+        follows = "canvas => canvas.width === Math.round(canvas.clientWidth * devicePixelRatio)"
+        page.wait_for_function(follows, arg=canvas)  # fails after 30 s; a fixed pause was too short on a busy machine
         assert page.evaluate("document.documentElement.scrollWidth") <= width // 2 + 150
 
 
