@@ -4,6 +4,8 @@ PYTHON ?= python3
 TORCH_INDEX ?=
 # Waiting threads must not occupy a core: see cli.main.
 export OMP_WAIT_POLICY ?= PASSIVE
+# Without .pyc files, pytest compiles every test anew in each worker: 10 s of `make test`.
+export PYTHONDONTWRITEBYTECODE :=
 VENV := .venv
 BIN := $(VENV)/bin
 INDEX := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX),)

@@ -184,8 +184,9 @@ def test_dots_of_another_width_than_stated_are_refused() -> None:
     assert "pitches wide" in view.reason
 
 
-@pytest.mark.parametrize("picture", [np.zeros((100, 120), np.uint8), Scene(at_mm=(200.0, 0.0)).picture()])
-def test_a_picture_without_a_plate_is_refused_in_one_line(picture: np.ndarray) -> None:
+@pytest.mark.parametrize("scene", [None, Scene(at_mm=(200.0, 0.0))], ids=["black", "beside the picture"])
+def test_a_picture_without_a_plate_is_refused_in_one_line(scene: Scene | None) -> None:
+    picture = np.zeros((100, 120), np.uint8) if scene is None else scene.picture()
     view = see_plate(picture, PLATE, "cam1_00.png")
     assert view.state == "refused"
     assert view.reason.startswith("cam1_00.png: expected a lattice")
