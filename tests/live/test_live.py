@@ -99,12 +99,13 @@ def test_times_that_stand_or_go_back_begin_anew(tmp_path_factory):
         assert off_deg(now, k) < 0.2
 
 
-def test_the_command_writes_and_sends_each_frame(tmp_path):
+def test_the_command_writes_and_sends_each_frame(tmp_path, tmp_path_factory):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as reader:
         reader.bind(("127.0.0.1", 0))
         reader.settimeout(LIMIT_S)
         to = [tmp_path / "a.dat", tmp_path / "a.jsonl", f"udp:{reader.getsockname()[1]}"]
         command = ["live", str(EXCERPT / "experiment.yaml"), "--source", "movie-fast"]
+        command += ["--learnt", str(known(tmp_path_factory))]
         run = CliRunner().invoke(app, [*command, *(word for one in to for word in ("--to", str(one)))])
         assert run.exit_code == 0, run.output
         assert reader.recv(2000).startswith(b"FT, 0, ")
