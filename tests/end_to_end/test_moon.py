@@ -23,6 +23,7 @@ def test_the_ephemeris_agrees_with_another_one():
         assert at.phase == pytest.approx(float(row["phase_deg"]), abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 def test_a_photograph_of_the_full_moon_shows_the_point_in_whose_zenith_the_camera_is(tmp_path):
     pytest.importorskip("astronomy")
