@@ -99,23 +99,24 @@ class Scene:
         u = (np.arange(SIZE[0])[:, None] + steps).ravel()
         v = (np.arange(SIZE[1])[:, None] + steps).ravel()
         middle = np.array(SIZE) / 2 - 0.5
-        ray = np.stack(
-            [*np.meshgrid((u - middle[0]) / self.f_px, (v - middle[1]) / self.f_px), np.ones((len(v), len(u)))]
-        )
+        right, down = (u - middle[0]) / self.f_px, (v - middle[1])[:, None] / self.f_px
         R, T = self.R_lab_plate.numpy(), self.T_lab_plate.numpy()
-        depth = (R[:, 2] @ T) / np.tensordot(R[:, 2], ray, 1)
-        x, y = (np.tensordot(R[:, k], ray, 1) * depth - R[:, k] @ T for k in (0, 1))
-        i, j = np.rint(x / plate.pitch_mm).astype(int), np.rint(y / plate.pitch_mm).astype(int)
-        index = np.stack([i.ravel(), j.ravel()], axis=1)
-        width = np.zeros(len(index))
-        held = plate.holds(index)
-        width[held] = plate.diameters(index[held])
-        for at in small:
-            width[(index == at).all(axis=1)] = plate.dot_diameter_mm
-        for at in without:
-            width[(index == at).all(axis=1)] = 0
-        away = np.hypot(x - i * plate.pitch_mm, y - j * plate.pitch_mm).ravel()
-        dot = (away < width / 2).reshape(x.shape)
+        along = [right * R[0, k] + down * R[1, k] + R[2, k] for k in range(3)]  # components of the rays on the plate
+        depth = (R[:, 2] @ T) / along[2]
+        x, y = (along[k] * depth - R[:, k] @ T for k in (0, 1))
+        i, j = np.rint(x / plate.pitch_mm), np.rint(y / plate.pitch_mm)
+        width = np.zeros((plate.columns + 2, plate.rows + 2))  # with a border that holds no dots
+        width[1:-1, 1:-1].T.flat = plate.diameters(plate.indices)  # row after row
+        before = np.array(plate.first) - 1
+        for of, width_mm in ((small, plate.dot_diameter_mm), (without, 0.0)):
+            for at in of:
+                width[tuple(at - before)] = width_mm
+        here = (
+            np.clip(at - low, 0, size - 1).astype(np.int64)
+            for at, low, size in zip((i, j), before, width.shape, strict=True)
+        )
+        away2 = (x - i * plate.pitch_mm) ** 2 + (y - j * plate.pitch_mm) ** 2
+        dot = away2 < (width**2 / 4)[tuple(here)]
         half = (np.array([plate.columns, plate.rows]) + 0.5) * plate.pitch_mm / 2
         board = (np.abs(x) < half[0]) & (np.abs(y) < half[1])
         paint, ground = (0.03, 1.0) if plate.dark else (1.0, 0.1)

@@ -42,10 +42,17 @@ RIG = rig_of()
 
 
 @cache
+def seen(count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Positions and orientations, and their evenly lit pictures."""
+    X, R = balls(count, 4)
+    return X, R, pictures_of(RIG, "patches", X, R)
+
+
+@cache
 def studied(count: int, lobe: float, *, glints: bool) -> tuple[Pixels, FittedPoses, Tensor, SphereModel]:
     """Fits to pictures with a reflection; without `glints` no model holds it."""
-    X, R = balls(count, 4)
-    pictures = pictures_of(RIG, "patches", X, R)
+    X, R, pictures = seen(count)
+    pictures = pictures.clone()
     row, column = torch.meshgrid(*(torch.arange(size) for size in pictures.shape[-2:]), indexing="ij")
     for c, camera in enumerate(RIG.cameras):
         middle, radius = camera.project(X), RIG.diameter_px / 2
@@ -153,8 +160,8 @@ def test_one_camera_alone_errs_by_more_than_with_its_position_held():
 
 @pytest.mark.parametrize("wider_px", [-0.04, 0.0, 0.06])
 def test_the_blur_of_the_limb_is_found(wider_px: float):
-    X, R = balls(COUNT, 4)
-    pixels = cut(RIG, noisy(pictures_of(RIG, "patches", X, R), 1.0, 7), X)
+    X, R, pictures = seen(COUNT)
+    pixels = cut(RIG, noisy(pictures, 1.0, 7), X)
     model, use = model_of(RIG.table("patches"), 1.0), torch.ones(COUNT, 2, dtype=torch.bool)
     model = replace(model, blur_px=model.blur_px - wider_px)
     fit = refined(pixels, PoseStart(X, R, use), model)
@@ -162,8 +169,7 @@ def test_the_blur_of_the_limb_is_found(wider_px: float):
 
 
 def test_the_blur_of_the_limb_is_learnt_where_that_of_the_paint_is_another():
-    X, R = balls(COUNT, 4)
-    pictures = pictures_of(RIG, "patches", X, R)
+    X, R, pictures = seen(COUNT)
     use, blur_px = torch.ones(COUNT, 2, dtype=torch.bool), 0.9 * BLUR_PX  # as of disks larger than the table's
     empty = scene_of(np.full(pictures.shape[-2:], BEHIND, np.float32))
     fitter = fitter_of(RIG, blur_px)
