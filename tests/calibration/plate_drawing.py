@@ -106,17 +106,16 @@ class Scene:
         x, y = (along[k] * depth - R[:, k] @ T for k in (0, 1))
         i, j = np.rint(x / plate.pitch_mm), np.rint(y / plate.pitch_mm)
         width = np.zeros((plate.columns + 2, plate.rows + 2))  # with a border that holds no dots
-        width[1:-1, 1:-1].T.flat = plate.diameters(plate.indices)  # row after row
         before = np.array(plate.first) - 1
-        for of, width_mm in ((small, plate.dot_diameter_mm), (without, 0.0)):
-            for at in of:
-                width[tuple(at - before)] = width_mm
-        here = (
-            np.clip(at - low, 0, size - 1).astype(np.int64)
-            for at, low, size in zip((i, j), before, width.shape, strict=True)
-        )
-        away2 = (x - i * plate.pitch_mm) ** 2 + (y - j * plate.pitch_mm) ** 2
-        dot = away2 < (width**2 / 4)[tuple(here)]
+        width[tuple((plate.indices - before).T)] = plate.diameters(plate.indices)
+        for at in small:
+            width[tuple(at - before)] = plate.dot_diameter_mm
+        for at in without:
+            width[tuple(at - before)] = 0
+        column = np.clip(i - before[0], 0, plate.columns + 1).astype(int)
+        row = np.clip(j - before[1], 0, plate.rows + 1).astype(int)
+        away = np.hypot(x - i * plate.pitch_mm, y - j * plate.pitch_mm)
+        dot = away < width[column, row] / 2
         half = (np.array([plate.columns, plate.rows]) + 0.5) * plate.pitch_mm / 2
         board = (np.abs(x) < half[0]) & (np.abs(y) < half[1])
         paint, ground = (0.03, 1.0) if plate.dark else (1.0, 0.1)

@@ -72,7 +72,7 @@ def studied(count: int, lobe: float, *, glints: bool) -> tuple[Pixels, FittedPos
 @cache
 def measured(count: int, lobe: float, *, glints: bool = False) -> tuple[Tensor, FittedPoses, Lasting]:
     """Errors (B, 6), rad and mm, of such fits, and their errors that last."""
-    X, R = balls(count, 4)
+    X, R, _ = seen(count)
     pixels, fit, use, model = studied(count, lobe, glints=glints)
     found = lasting_errors(pixels, fit, use, model)
     off = torch.cat([so3.log(fit.R_lab_body @ R.mT), fit.position_lab_mm - X], dim=-1)
